@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""slamdepth: one camera in, a metric trajectory and a mesh out."""

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All settings of a run: frozen, validated, passed on explicitly.
+
+Command line over YAML file over these defaults. A name that does not exist is an
+error that lists those that do.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from slamdepth.errors import ConfigError
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class FeatureConfig(_Section):
+    """Keypoints and descriptors."""
+
+    name: str = Field("orb", description="feature by its registered name")
+    count: int = Field(1000, ge=100, le=10000, description="keypoints kept per frame")
+    levels: int = Field(8, ge=1, le=12, description="pyramid levels")
+    scale_factor: float = Field(1.2, gt=1.0, le=2.0, description="ratio of one level to the next")
+    fast_threshold: int = Field(7, ge=1, le=100, description="lowest FAST contrast, grey values")
+
+
+class DepthConfig(_Section):
+    """The depth prior of a keyframe."""
+
+    name: str = Field("dinov2", description="depth model by its registered name")
+    min_m: float = Field(0.1, gt=0, description="nearer depth is dropped")
+    max_m: float = Field(10.0, gt=0, description="farther depth is dropped")
+    max_sigma_log: float = Field(
+        0.6, gt=0, description="predicted pixels less sure than this never become map points"
+    )
+
+
+class MapConfig(_Section):
+    """TSDF fusion and the mesh."""
+
+    voxel_size_m: float = Field(0.02, gt=0, le=1.0, description="edge of a voxel in metres")
+    max_depth_m: float = Field(4.0, gt=0, description="depth beyond this is not fused")
+    min_component_triangles: int = Field(
+        200, ge=0, description="connected specks of the mesh with fewer triangles are removed"
+    )
+
+
+class Config(_Section):
+    """Every setting of a run."""
+
+    seed: int = Field(0, ge=0, description="seed of everything random")
+    device: Literal["cpu", "cuda"] = Field("cpu", description="where networks run")
+    odometry: Literal["orb", "kiss-icp"] = Field("orb", description="what estimates the motion")
+    features: FeatureConfig = FeatureConfig()
+    depth: DepthConfig = DepthConfig()
+    map: MapConfig = MapConfig()
+
+    @classmethod
+    def from_yaml(cls, path: str | Path, overrides: dict[str, Any] | None = None) -> Config:
+        """Read ``path`` and lay ``overrides`` (nested dicts) over it.
+
+        Raises:
+            ConfigError: the file is missing, is no mapping, or has an unknown or
+                out-of-range setting; names the setting and the allowed ones.
+        """
+        path = Path(path)
+        try:
+            loaded = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot read the settings: {error.strerror}") from error
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            first_line = str(error).splitlines()[0]
+            raise ConfigError(f"{path}: not valid YAML: {first_line}") from error
+        if not isinstance(loaded, dict):
+            raise ConfigError(f"{path}: expected 'name: value' settings, found a {type(loaded).__name__}")
+        return cls.from_dict(merge(loaded, overrides or {}), origin=str(path))
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any], origin: str = "settings") -> Config:
+        """Validate nested ``values``; ``origin`` is named in errors.
+
+        Raises:
+            ConfigError: a setting is unknown or out of range.
+        """
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise ConfigError(f"{origin}: {_first_problem(error)}") from error
+
+    def to_yaml(self) -> str:
+        """The settings as YAML that :meth:`from_yaml` reads back."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Nested ``base`` with the values of ``over`` laid on top; neither is changed."""
+    merged = dict(base)
+    for key, value in over.items():
+        if isinstance(value, dict) and isinstance(merged.get(key), dict):
+            merged[key] = merge(merged[key], value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    name = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        section: type[BaseModel] = Config
+        for part in problem["loc"][:-1]:
+            annotation = section.model_fields[str(part)].annotation
+            assert isinstance(annotation, type) and issubclass(annotation, BaseModel)
+            section = annotation
+        return f"unknown setting '{name}'; allowed here: {', '.join(sorted(section.model_fields))}"
+    return f"setting '{name}': {problem['msg']} (got {problem['input']!r})"

@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The value types every room of the house speaks.
+
+Conventions, everywhere: poses are ``(4, 4)`` float64 named ``T_world_camera`` with
+``p_world = T_world_camera @ p_camera``; camera axes are x right, y down, z forward;
+the world is the first camera; pixels have integer centres; depth is along z, in
+metres, 0 where unknown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slamdepth.errors import CameraError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with Brown-Conrady distortion.
+
+    Attributes:
+        width, height: image size in pixels.
+        fx, fy, cx, cy: intrinsics in pixels; the centre of the top left pixel is (0, 0).
+        distortion: ``(k1, k2, p1, p2, k3)`` as OpenCV orders them, or all zero.
+        depth_factor: raw units of a depth image per metre.
+        fps: nominal frame rate in Hz.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    depth_factor: float = 5000.0
+    fps: float = 30.0
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy, self.depth_factor, self.fps, *self.distortion)
+        if not all(np.isfinite(values)):
+            raise CameraError("camera: intrinsics must be finite numbers")
+        if self.width < 1 or self.height < 1:
+            raise CameraError(f"camera: width and height must be positive, got {self.width}x{self.height}")
+        if self.fx <= 0 or self.fy <= 0:
+            raise CameraError(f"camera: fx and fy must be positive, got {self.fx}, {self.fy}")
+        if self.depth_factor <= 0 or self.fps <= 0:
+            raise CameraError("camera: depth_factor and fps must be positive")
+        if len(self.distortion) != 5:
+            raise CameraError("camera: distortion needs five numbers [k1, k2, p1, p2, k3]")
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """The ``(3, 3)`` intrinsic matrix in pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def distortion_array(self) -> NDArray[np.float64]:
+        """Distortion as the ``(5,)`` array OpenCV takes."""
+        return np.asarray(self.distortion, dtype=np.float64)
+
+    @property
+    def is_distorted(self) -> bool:
+        return any(self.distortion)
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same camera for images resized to ``width`` x ``height`` pixels.
+
+        Pixel centres are integers, so ``cx' = (cx + 0.5) * sx - 0.5``.
+        """
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+        )
+
+    def without_distortion(self) -> Camera:
+        """The pinhole camera that undistorted pixels belong to."""
+        return replace(self, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
+
+    def undistort_points(self, points_px: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Map raw pixels ``(N, 2)`` to pixels ``(N, 2)`` of :meth:`without_distortion`."""
+        points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 2)
+        if not self.is_distorted or len(points) == 0:
+            return points.copy()
+        import cv2
+
+        return cv2.undistortPoints(
+            points[:, None], self.K, self.distortion_array, P=self.K
+        ).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One colour image of a sequence, as the camera took it (not undistorted).
+
+    Attributes:
+        index: position in its sequence.
+        timestamp_s: seconds, strictly increasing over a sequence.
+        image_rgb: ``(H, W, 3)`` uint8.
+        camera: the camera that took it.
+        depth_m: ``(H, W)`` float32 sensor depth in metres registered to the colour
+            image, 0 where unknown; None where the sequence has none.
+    """
+
+    index: int
+    timestamp_s: float
+    image_rgb: NDArray[np.uint8]
+    camera: Camera
+    depth_m: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        expected = (self.camera.height, self.camera.width, 3)
+        if self.image_rgb.shape != expected or self.image_rgb.dtype != np.uint8:
+            raise CameraError(
+                f"frame {self.index}: image is {self.image_rgb.shape} {self.image_rgb.dtype}, "
+                f"the camera says {expected} uint8"
+            )
+        if self.depth_m is not None and self.depth_m.shape != expected[:2]:
+            raise CameraError(
+                f"frame {self.index}: depth is {self.depth_m.shape}, the colour image {expected[:2]}"
+            )
+
+
+class DepthKind(str, Enum):
+    """What the numbers of a depth map mean."""
+
+    METRIC = "metric depth"
+    AFFINE_DEPTH = "affine depth"
+    AFFINE_INVERSE_DEPTH = "affine inverse depth"
+
+
+@dataclass(frozen=True)
+class DepthPrediction:
+    """A dense map from a depth model, at the resolution of the frame it was made for.
+
+    Attributes:
+        values: ``(H, W)`` float32; metres for METRIC, unitless otherwise; 0 = unknown.
+        kind: what ``values`` means. Only ``slamdepth.depth.alignment`` turns a
+            prediction into metres of the map.
+        sigma_log: ``(H, W)`` float32 standard deviation of the natural logarithm of the
+            depth (about the relative error), or None where the model does not say.
+        is_sensor: True where the values were measured rather than predicted, so that
+            their errors are independent from pixel to pixel and their scale is exact.
+    """
+
+    values: NDArray[np.float32]
+    kind: DepthKind
+    sigma_log: NDArray[np.float32] | None = None
+    is_sensor: bool = False
+
+
+@dataclass(frozen=True)
+class WeightsInfo:
+    """Where the numbers of a model come from."""
+
+    name: str
+    sha256: str
+    trained_on: str
+    licence: str
+
+
+class TrackingStatus(str, Enum):
+    """State of the tracker after a frame."""
+
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+    RELOCALISED = "relocalised"
+    RESCUED = "rescued by registration"
+    LOST = "lost"
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one ``Tracker.step`` says about its frame.
+
+    Attributes:
+        status: state after this frame.
+        T_world_camera: ``(4, 4)``, or None where the frame could not be placed.
+        inliers: number of map points that agree with the pose.
+        is_keyframe: True where the frame became a keyframe.
+        keyframes, loop_closures: totals so far.
+        timings_ms: wall time of each stage in milliseconds.
+    """
+
+    index: int
+    timestamp_s: float
+    status: TrackingStatus
+    T_world_camera: NDArray[np.float64] | None
+    inliers: int = 0
+    is_keyframe: bool = False
+    keyframes: int = 0
+    loop_closures: int = 0
+    timings_ms: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Timestamped camera poses.
+
+    Attributes:
+        timestamps_s: ``(N,)`` float64, strictly increasing.
+        T_world_camera: ``(N, 4, 4)`` float64.
+        is_metric: False where the unit of length is unknown.
+    """
+
+    timestamps_s: NDArray[np.float64]
+    T_world_camera: NDArray[np.float64]
+    is_metric: bool = True
+
+    def __post_init__(self) -> None:
+        n = len(self.timestamps_s)
+        if self.timestamps_s.shape != (n,) or self.T_world_camera.shape != (n, 4, 4):
+            raise ValueError(
+                f"a trajectory needs (N,) times and (N, 4, 4) poses, got "
+                f"{self.timestamps_s.shape} and {self.T_world_camera.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.timestamps_s)
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A keyframe after optimisation, with what the map fusion needs.
+
+    Attributes:
+        id: number of the keyframe, from 0.
+        frame: its image (and sensor depth where there is one).
+        T_world_camera: ``(4, 4)`` optimised pose.
+        depth_m: ``(H, W)`` float32 metres of the map, 0 where unknown or dropped;
+            in the raw (distorted) pixels of the frame.
+        sigma_log: ``(H, W)`` float32 or None; see :class:`DepthPrediction`.
+        keypoints_px: ``(N, 2)`` float64 raw pixels.
+        depth_scale: factor that turned the prediction into metres of the map.
+        prediction: the map before scaling, as the model gave it.
+    """
+
+    id: int
+    frame: Frame
+    T_world_camera: NDArray[np.float64]
+    depth_m: NDArray[np.float32]
+    sigma_log: NDArray[np.float32] | None
+    keypoints_px: NDArray[np.float64]
+    depth_scale: float
+    prediction: DepthPrediction
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What ``Tracker.finish`` returns.
+
+    Attributes:
+        trajectory: every placed frame after optimisation.
+        keyframes: the optimised keyframes in order of time.
+        points_m: ``(P, 3)`` float64 map points in the world frame, metres of the map.
+        frames, tracked, loop_closures, relocalisations, rescues: counts over the run.
+        timings_ms: mean milliseconds per call of each stage.
+    """
+
+    trajectory: Trajectory
+    keyframes: tuple[Keyframe, ...]
+    points_m: NDArray[np.float64]
+    frames: int
+    tracked: int
+    loop_closures: int
+    relocalisations: int
+    rescues: int
+    timings_ms: dict[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    extra: dict[str, Any] = field(default_factory=dict)
