@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pure functions of rigid motion and pinhole projection; nothing here keeps state.
+
+Tangents of SE(3) are ``(translation, rotation)`` unless a name says otherwise; the one
+adapter to GTSAM (rotation first) lives in ``slamdepth.backend``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.types import Camera
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+
+def invert(T: Array) -> Array:
+    """Inverse of rigid transforms ``(..., 4, 4)``."""
+    R = T[..., :3, :3]
+    inverse = np.zeros_like(T)
+    inverse[..., :3, :3] = np.swapaxes(R, -1, -2)
+    inverse[..., :3, 3] = -np.einsum("...ji,...j->...i", R, T[..., :3, 3])
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def transform(T_a_b: Array, points_b: Array) -> Array:
+    """Points ``(N, 3)`` of frame b in frame a."""
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def skew(v: Array) -> Array:
+    """Cross product matrices ``(..., 3, 3)`` of vectors ``(..., 3)``."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def so3_exp(omega: Array) -> Array:
+    """Rotation matrices ``(..., 3, 3)`` of rotation vectors ``(..., 3)`` in radians (Rodrigues)."""
+    omega = np.asarray(omega, dtype=np.float64)
+    theta2 = np.sum(omega * omega, axis=-1)[..., None, None]
+    theta = np.sqrt(theta2)
+    small = theta2 < 1e-12
+    safe = np.where(small, 1.0, theta)
+    a = np.where(small, 1.0 - theta2 / 6.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - theta2 / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
+    W = skew(omega)
+    return np.eye(3) + a * W + b * (W @ W)
+
+
+def so3_log(R: Array) -> Array:
+    """Rotation vectors ``(..., 3)`` in radians of rotation matrices ``(..., 3, 3)``."""
+    from scipy.spatial.transform import Rotation
+
+    flat = np.asarray(R, dtype=np.float64).reshape(-1, 3, 3)
+    return Rotation.from_matrix(flat).as_rotvec().reshape(*R.shape[:-2], 3)
+
+
+def se3_exp(xi: Array) -> Array:
+    """Rigid transforms ``(..., 4, 4)`` of tangents ``(..., 6)``, translation first.
+
+    Rotation by the exponential map, translation taken as it is: a retraction of
+    R^3 x SO(3), which is what the optimisers here step on.
+    """
+    xi = np.asarray(xi, dtype=np.float64)
+    T = np.zeros((*xi.shape[:-1], 4, 4))
+    T[..., :3, :3] = so3_exp(xi[..., 3:])
+    T[..., :3, 3] = xi[..., :3]
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def rotation_angle_rad(R: Array) -> Array:
+    """Angles ``(...)`` in radians of rotation matrices ``(..., 3, 3)``."""
+    return np.linalg.norm(so3_log(R), axis=-1)
+
+
+def orthonormalised(T: Array) -> Array:
+    """Rigid transforms ``(..., 4, 4)`` whose rotations are exactly orthonormal again."""
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    det = np.linalg.det(U @ Vt)
+    U = U.copy()
+    U[..., :, 2] *= det[..., None]
+    out = T.copy()
+    out[..., :3, :3] = U @ Vt
+    return out
+
+
+def quat_xyzw_to_rotation(quat_xyzw: Array) -> Array:
+    """Rotation matrices ``(..., 3, 3)`` of quaternions ``(..., 4)`` in TUM order x y z w."""
+    q = np.asarray(quat_xyzw, dtype=np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    R = np.empty((*q.shape[:-1], 3, 3))
+    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    return R
+
+
+def rotation_to_quat_xyzw(R: Array) -> Array:
+    """Quaternions ``(..., 4)`` x y z w with w >= 0 of rotation matrices ``(..., 3, 3)``."""
+    from scipy.spatial.transform import Rotation
+
+    flat = np.asarray(R, dtype=np.float64).reshape(-1, 3, 3)
+    return Rotation.from_matrix(flat).as_quat(canonical=True).reshape(*R.shape[:-2], 4)
+
+
+def project(camera: Camera, points_c: Array) -> tuple[Array, Array]:
+    """Project points ``(N, 3)`` of the camera frame, without distortion.
+
+    Returns:
+        Pixels ``(N, 2)`` and depths ``(N,)``; pixels of points at or behind the image
+        plane are meaningless, so check the depth.
+    """
+    z = points_c[:, 2]
+    safe = np.where(np.abs(z) < 1e-9, 1e-9, z)
+    u = camera.fx * points_c[:, 0] / safe + camera.cx
+    v = camera.fy * points_c[:, 1] / safe + camera.cy
+    return np.stack([u, v], axis=1), z
+
+
+def backproject(camera: Camera, points_px: Array, depth_m: Array) -> Array:
+    """Points ``(N, 3)`` of the camera frame from undistorted pixels ``(N, 2)`` and depths ``(N,)``."""
+    x = (points_px[:, 0] - camera.cx) / camera.fx * depth_m
+    y = (points_px[:, 1] - camera.cy) / camera.fy * depth_m
+    return np.stack([x, y, depth_m], axis=1)
+
+
+def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Array, Array]:
+    """Least-squares ``target = scale * R @ source + t`` for ``(N, 3)`` points (Umeyama 1991).
+
+    Returns:
+        ``(scale, R (3, 3), t (3,))``; the scale is 1 unless ``with_scale``.
+    """
+    mu_s, mu_t = source.mean(axis=0), target.mean(axis=0)
+    ds, dt = source - mu_s, target - mu_t
+    U, S, Vt = np.linalg.svd(dt.T @ ds / len(source))
+    sign = np.ones(3)
+    if np.linalg.det(U) * np.linalg.det(Vt) < 0:
+        sign[2] = -1.0
+    R = (U * sign) @ Vt
+    scale = 1.0
+    if with_scale:
+        variance = np.mean(np.sum(ds * ds, axis=1))
+        scale = float(np.sum(S * sign) / variance) if variance > 0 else 1.0
+    return scale, R, mu_t - scale * R @ mu_s
