@@ -30,6 +30,36 @@ class FeatureConfig(_Section):
     fast_threshold: int = Field(7, ge=1, le=100, description="lowest FAST contrast, grey values")
 
 
+class TrackingConfig(_Section):
+    """Placing a frame in the map, and choosing keyframes."""
+
+    min_inliers: int = Field(20, ge=6, description="fewer agreeing points and the frame is lost")
+    keyframe_overlap: float = Field(
+        0.7, gt=0, lt=1, description="a keyframe is made when less of the last one is still seen"
+    )
+    keyframe_min_inliers: int = Field(100, ge=0, description="... or when fewer points agree")
+    local_keyframes: int = Field(12, ge=2, description="keyframes whose points are searched for")
+
+
+class BundleConfig(_Section):
+    """Local and global bundle adjustment."""
+
+    window: int = Field(10, ge=2, description="keyframes adjusted together after each new one")
+    fixed: int = Field(10, ge=1, description="further keyframes that hold the window in place")
+    final: bool = Field(True, description="adjust the whole map once at the end")
+    scale_sigma: float = Field(
+        0.1, ge=0, description="deviation of a keyframe's common relative depth error"
+    )
+
+
+class LoopConfig(_Section):
+    """Loop closure."""
+
+    enabled: bool = Field(True, description="look for places seen before")
+    min_inliers: int = Field(30, ge=8, description="agreeing points a loop needs")
+    min_gap: int = Field(10, ge=1, description="keyframes between the two ends of a loop, at least")
+
+
 class DepthConfig(_Section):
     """The depth prior of a keyframe."""
 
@@ -58,6 +88,9 @@ class Config(_Section):
     device: Literal["cpu", "cuda"] = Field("cpu", description="where networks run")
     odometry: Literal["orb", "kiss-icp"] = Field("orb", description="what estimates the motion")
     features: FeatureConfig = FeatureConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    bundle: BundleConfig = BundleConfig()
+    loops: LoopConfig = LoopConfig()
     depth: DepthConfig = DepthConfig()
     map: MapConfig = MapConfig()
 

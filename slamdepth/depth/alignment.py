@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From what a depth model says to metres of the map.
+
+The one place where a :class:`DepthPrediction` becomes depth. A prediction is taken as
+right up to an error that is mostly common to the image and otherwise smooth over it and
+over surfaces. That error is observed wherever the map already has a point, so it is
+estimated there and interpolated in between: Gaussian process regression of the log ratio
+of map depth to predicted depth, over pixel position and predicted depth (Rasmussen and
+Williams, "Gaussian Processes for Machine Learning", 2006, eq. 2.25-2.26). Where the map
+knows nothing the prior's own deviation remains, so the answer always comes with its
+uncertainty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.errors import TrackingError
+from slamdepth.types import DepthKind, DepthPrediction
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+DEFAULT_SIGMA_LOG = 0.25
+"""Deviation of log depth assumed where a model gives none."""
+
+MAX_ANCHORS = 300
+
+
+@dataclass(frozen=True)
+class FieldSettings:
+    """Shape of the prediction's error.
+
+    Attributes:
+        length_px: correlation length over the image, pixels of a 640 wide image.
+        length_log: correlation length over log depth: points at another depth belong
+            to another surface.
+        white_share: share of the variance that no neighbour tells anything about.
+        common_sigma: deviation of the log scale common to the image.
+    """
+
+    length_px: float = 80.0
+    length_log: float = 0.3
+    white_share: float = 0.2
+    common_sigma: float = 0.3
+
+
+class DepthField:
+    """A prediction tied to the map's points: log depth and its deviation at any pixel."""
+
+    def __init__(
+        self,
+        anchor_px: Floats,
+        anchor_log: Floats,
+        anchor_sigma: Floats,
+        solved: Floats,
+        factor: tuple[Floats, bool] | None,
+        offset: float,
+        unit_px: float,
+        settings: FieldSettings,
+    ) -> None:
+        self._px, self._log, self._sigma = anchor_px, anchor_log, anchor_sigma
+        self._solved, self._factor = solved, factor
+        self.offset = offset
+        self._unit_px = unit_px
+        self._settings = settings
+
+    @property
+    def anchors(self) -> int:
+        """Number of map points the field was tied to."""
+        return len(self._px)
+
+    def correction(self, px: Floats, log_predicted: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+        """Log correction and posterior deviation at pixels.
+
+        Args:
+            px: ``(N, 2)`` raw pixels; log_predicted: ``(N,)``; sigma: ``(N,)`` the
+                prediction's own deviation.
+
+        Returns:
+            ``(correction (N,), sigma (N,))``; add the first to ``log_predicted``.
+        """
+        s = self._settings
+        variance = sigma**2 + s.common_sigma**2
+        if self._factor is None:
+            return np.full(len(px), self.offset), np.sqrt(variance)
+        from scipy.linalg import cho_solve
+
+        K = self._kernel(px, log_predicted, sigma, self._px, self._log, self._sigma)
+        mean = self.offset + K @ self._solved
+        reduction = np.einsum("ij,ji->i", K, cho_solve(self._factor, K.T, check_finite=False))
+        floor = s.white_share * sigma**2
+        return mean, np.sqrt(np.maximum(variance - reduction, np.maximum(floor, 1e-6)))
+
+    def mean(self, px: Floats, log_predicted: Floats, sigma: Floats) -> Floats:
+        """Only the log correction ``(N,)``; cheaper, for dense maps."""
+        if self._factor is None:
+            return np.full(len(px), self.offset)
+        return self.offset + self._kernel(px, log_predicted, sigma, self._px, self._log, self._sigma) @ self._solved
+
+    def _kernel(self, pa: Floats, la: Floats, sa: Floats, pb: Floats, lb: Floats, sb: Floats) -> Floats:
+        s = self._settings
+        a = np.column_stack([pa / (s.length_px * self._unit_px), la / s.length_log])
+        b = np.column_stack([pb / (s.length_px * self._unit_px), lb / s.length_log])
+        square = (a * a).sum(1)[:, None] + (b * b).sum(1)[None] - 2.0 * a @ b.T
+        smooth = (1.0 - s.white_share) * sa[:, None] * sb[None] * np.exp(-0.5 * np.maximum(square, 0.0))
+        return smooth + s.common_sigma**2
+
+
+def log_depth_of(prediction: DepthPrediction) -> tuple[Floats, Floats]:
+    """Natural log of a metric prediction and its deviation, ``(H, W)`` each; NaN = unknown.
+
+    Raises:
+        TrackingError: the prediction is not metric. Relative depth has to be made metric
+            against known points first; taking disparity for depth is never right.
+    """
+    if prediction.kind is not DepthKind.METRIC:
+        raise TrackingError(
+            f"a {prediction.kind.value} map cannot be read as metres; use a metric depth model"
+        )
+    values = prediction.values
+    known = np.isfinite(values) & (values > 0)
+    log = np.full(values.shape, np.nan)
+    log[known] = np.log(values[known])
+    sigma = prediction.sigma_log
+    return log, np.full(values.shape, DEFAULT_SIGMA_LOG) if sigma is None else sigma.astype(np.float64)
+
+
+def fit_depth_field(
+    px: Floats,
+    log_predicted: Floats,
+    sigma: Floats,
+    log_map: Floats,
+    sigma_map: Floats,
+    *,
+    width: int,
+    prior_offset: float = 0.0,
+    settings: FieldSettings | None = None,
+) -> DepthField:
+    """Tie a prediction to map points.
+
+    Args:
+        px: ``(N, 2)`` raw pixels of known points; log_predicted, sigma: ``(N,)`` the
+            prediction there; log_map, sigma_map: ``(N,)`` log depth of the map's points
+            in this camera, and its deviation.
+        width: image width in pixels, which ``length_px`` is scaled by.
+        prior_offset: expected log ratio of map to prediction before any point is seen.
+    """
+    settings = settings or FieldSettings()
+    ratio = log_map - log_predicted
+    good = np.isfinite(ratio) & np.isfinite(sigma) & np.isfinite(sigma_map)
+    if np.count_nonzero(good) >= 8:
+        median = np.median(ratio[good])
+        spread = 1.4826 * np.median(np.abs(ratio[good] - median)) + 0.02
+        good &= np.abs(ratio - median) < 3.5 * spread
+    index = np.flatnonzero(good)
+    if len(index) > MAX_ANCHORS:
+        surest = index[np.argsort(sigma_map[index], kind="stable")[: 2 * MAX_ANCHORS]]
+        index = np.sort(surest[:: max(1, len(surest) // MAX_ANCHORS)][:MAX_ANCHORS])
+    unit_px = width / 640.0
+    field = DepthField(
+        px[index], log_predicted[index], sigma[index], np.zeros(len(index)), None, prior_offset, unit_px, settings
+    )
+    if len(index) == 0:
+        return field
+    from scipy.linalg import cho_factor, cho_solve
+
+    K = field._kernel(
+        field._px, field._log, field._sigma, field._px, field._log, field._sigma
+    )
+    noise = sigma_map[index] ** 2 + settings.white_share * sigma[index] ** 2 + 1e-4
+    factor = cho_factor(K + np.diag(noise), lower=True, check_finite=False)
+    solved = cho_solve(factor, ratio[index] - prior_offset, check_finite=False)
+    return DepthField(
+        field._px, field._log, field._sigma, solved, factor, prior_offset, unit_px, settings
+    )
+
+
+def sample(values: Floats, px: Floats) -> Floats:
+    """Nearest values of an ``(H, W)`` map at raw pixels ``(N, 2)``."""
+    u = np.clip(np.rint(px[:, 0]).astype(np.int64), 0, values.shape[1] - 1)
+    v = np.clip(np.rint(px[:, 1]).astype(np.int64), 0, values.shape[0] - 1)
+    return values[v, u]
+
+
+def apply_field(field: DepthField, prediction: DepthPrediction, step_px: int = 8) -> NDArray[np.float32]:
+    """The whole prediction in metres of the map, ``(H, W)`` float32, 0 = unknown.
+
+    The correction is smooth, so it is evaluated every ``step_px`` pixels and interpolated.
+    """
+    import cv2
+
+    log, sigma = log_depth_of(prediction)
+    height, width = log.shape
+    rows, cols = np.arange(0, height, step_px), np.arange(0, width, step_px)
+    grid_u, grid_v = np.meshgrid(cols, rows)
+    px = np.column_stack([grid_u.ravel(), grid_v.ravel()]).astype(np.float64)
+    fallback = float(np.nanmedian(log)) if np.isfinite(log).any() else 0.0
+    at = np.nan_to_num(log[grid_v, grid_u].ravel(), nan=fallback)
+    coarse = field.mean(px, at, sigma[grid_v, grid_u].ravel()).reshape(grid_u.shape)
+    map_u, map_v = np.meshgrid(
+        np.arange(width, dtype=np.float32) / step_px, np.arange(height, dtype=np.float32) / step_px
+    )
+    dense = cv2.remap(
+        coarse.astype(np.float32), map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.nan_to_num(np.exp(log + dense), nan=0.0).astype(np.float32)

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sparse map while it grows: points in arrays, keyframes in a list.
+
+Points live in growing arrays and are named by their row, so that everything done to
+them is done to whole arrays. A point that dies keeps its row; one merged into another
+points there through ``alias``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slamdepth.geometry import invert
+from slamdepth.types import DepthPrediction, Frame
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+    Bools = NDArray[np.bool_]
+
+
+@dataclass
+class MapKeyframe:
+    """A keyframe while the map is being built; poses and point ids change.
+
+    Attributes:
+        features: see ``slamdepth.frontend.features.Features``.
+        T_camera_world: ``(4, 4)``.
+        point_ids: ``(N,)`` row of the map point each keypoint sees, -1 for none.
+        log_depth, sigma_log: ``(N,)`` depth prior of each keypoint in metres of the
+            map, NaN where it has none.
+    """
+
+    id: int
+    frame: Frame
+    features: Any
+    T_camera_world: Floats
+    point_ids: Ints
+    log_depth: Floats
+    sigma_log: Floats
+    prediction: DepthPrediction | None = None
+    scale: float = 1.0
+
+    @property
+    def center_w(self) -> Floats:
+        """Camera centre ``(3,)`` in the world."""
+        return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
+
+    @property
+    def T_world_camera(self) -> Floats:
+        return invert(self.T_camera_world)
+
+
+class LandmarkMap:
+    """Map points and the keyframes that see them."""
+
+    def __init__(self) -> None:
+        self.keyframes: list[MapKeyframe] = []
+        self.size = 0
+        self._grow(4096)
+
+    def _grow(self, capacity: int) -> None:
+        def bigger(name: str, shape: tuple[int, ...], dtype: Any) -> None:
+            array = np.zeros((capacity, *shape), dtype=dtype)
+            if self.size:
+                array[: self.size] = getattr(self, name)[: self.size]
+            setattr(self, name, array)
+
+        bigger("position_w", (3,), np.float64)
+        bigger("covariance_w", (3, 3), np.float64)
+        bigger("descriptor", (32,), np.uint8)
+        bigger("birth_keyframe", (), np.int64)
+        bigger("octave", (), np.int64)
+        bigger("distance_m", (), np.float64)
+        bigger("direction_w", (3,), np.float64)
+        bigger("visible", (), np.int64)
+        bigger("found", (), np.int64)
+        bigger("observations", (), np.int64)
+        bigger("alive", (), np.bool_)
+        bigger("alias", (), np.int64)
+
+    position_w: Floats
+    covariance_w: Floats
+    descriptor: NDArray[np.uint8]
+    birth_keyframe: Ints
+    octave: Ints
+    distance_m: Floats
+    direction_w: Floats
+    visible: Ints
+    found: Ints
+    observations: Ints
+    alive: Bools
+    alias: Ints
+
+    def add_points(
+        self, keyframe: MapKeyframe, feature: Ints, position_w: Floats, covariance_w: Floats
+    ) -> Ints:
+        """Give birth to points seen by ``keyframe`` at its keypoints ``feature``; returns their rows."""
+        n = len(feature)
+        while self.size + n > len(self.alive):
+            self._grow(2 * len(self.alive))
+        rows = np.arange(self.size, self.size + n)
+        self.size += n
+        self.position_w[rows] = position_w
+        self.covariance_w[rows] = covariance_w
+        self.descriptor[rows] = keyframe.features.descriptors[feature]
+        self.birth_keyframe[rows] = keyframe.id
+        self.octave[rows] = keyframe.features.octave[feature]
+        offset = position_w - keyframe.center_w
+        distance = np.linalg.norm(offset, axis=1)
+        self.distance_m[rows] = distance
+        self.direction_w[rows] = offset / np.maximum(distance, 1e-9)[:, None]
+        self.visible[rows] = 1
+        self.found[rows] = 1
+        self.observations[rows] = 1
+        self.alive[rows] = True
+        self.alias[rows] = rows
+        keyframe.point_ids[feature] = rows
+        return rows
+
+    def add_keyframe(self, keyframe: MapKeyframe) -> None:
+        self.keyframes.append(keyframe)
+        self.observations[keyframe.point_ids[keyframe.point_ids >= 0]] += 1
+
+    def resolve(self, rows: Ints) -> Ints:
+        """Rows after merges and deaths: -1 where the point is gone."""
+        out = rows.copy()
+        known = rows >= 0
+        target = self.alias[rows[known]]
+        for _ in range(8):
+            further = self.alias[target]
+            if np.array_equal(further, target):
+                break
+            target = further
+        out[known] = np.where(self.alive[target], target, -1)
+        return out
+
+    def merge(self, loser: int, winner: int) -> None:
+        """Let ``winner`` take over what ``loser`` is seen by."""
+        for keyframe in self.keyframes:
+            at = np.flatnonzero(keyframe.point_ids == loser)
+            if len(at) == 0:
+                continue
+            if np.any(keyframe.point_ids == winner):
+                keyframe.point_ids[at] = -1
+            else:
+                keyframe.point_ids[at] = winner
+                self.observations[winner] += 1
+        self.alive[loser] = False
+        self.alias[loser] = winner
+        self.visible[winner] += self.visible[loser]
+        self.found[winner] += self.found[loser]
+
+    def kill(self, rows: Ints) -> None:
+        """Remove points from the map and from every keyframe."""
+        if len(rows) == 0:
+            return
+        self.alive[rows] = False
+        dead = np.zeros(self.size, dtype=bool)
+        dead[rows] = True
+        for keyframe in self.keyframes:
+            ids = keyframe.point_ids
+            seen = ids >= 0
+            ids[seen & dead[np.where(seen, ids, 0)]] = -1
+
+    def drop_observations(self, keyframe_index: Ints, feature: Ints) -> None:
+        """Forget single observations; points left with none die."""
+        for k in np.unique(keyframe_index):
+            keyframe = self.keyframes[k]
+            at = feature[keyframe_index == k]
+            rows = keyframe.point_ids[at]
+            keyframe.point_ids[at] = -1
+            np.subtract.at(self.observations, rows[rows >= 0], 1)
+        self.alive[: self.size] &= self.observations[: self.size] > 0
+
+    def shared_points(self, rows: Ints) -> Ints:
+        """How many of the points ``rows`` each keyframe sees, ``(K,)``."""
+        mask = np.zeros(self.size + 1, dtype=bool)
+        mask[rows[rows >= 0]] = True
+        mask[-1] = False
+        return np.array([np.count_nonzero(mask[k.point_ids]) for k in self.keyframes], dtype=np.int64)
+
+    def covisible(self, rows: Ints, limit: int, minimum: int = 1) -> list[int]:
+        """Keyframes that see most of the points ``rows``, best first."""
+        shared = self.shared_points(rows)
+        order = np.argsort(-shared, kind="stable")[:limit]
+        return [int(k) for k in order if shared[k] >= minimum]
+
+    def points_of(self, keyframe_ids: list[int]) -> Ints:
+        """Rows of the living points the keyframes see, each once, ascending."""
+        mask = np.zeros(self.size + 1, dtype=bool)
+        for k in keyframe_ids:
+            mask[self.keyframes[k].point_ids] = True
+        mask[-1] = False
+        return np.flatnonzero(mask[: self.size] & self.alive[: self.size])
+
+    def sigma_along_ray(self, rows: Ints, center_w: Floats) -> Floats:
+        """Relative deviation ``(N,)`` of the distance of points from ``center_w`` ``(3,)``."""
+        offset = self.position_w[rows] - center_w
+        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-6)
+        ray = offset / distance[:, None]
+        variance = np.einsum("ni,nij,nj->n", ray, self.covariance_w[rows], ray)
+        return np.sqrt(np.maximum(variance, 0.0)) / distance

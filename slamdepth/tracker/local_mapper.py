@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What happens at a keyframe: birth of points, search in neighbours, local bundle adjustment."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.backend.bundle import BundleProblem, BundleResult, bundle_adjust
+from slamdepth.config import Config
+from slamdepth.depth.alignment import DepthField, fit_depth_field, log_depth_of, sample
+from slamdepth.frontend.features import Features
+from slamdepth.geometry import backproject, invert, transform
+from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.tracker.localiser import Localiser
+from slamdepth.types import Camera, DepthPrediction, Frame
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+
+class LocalMapper:
+    """Grows and refines a :class:`LandmarkMap`, one keyframe at a time."""
+
+    def __init__(self, camera: Camera, config: Config, landmarks: LandmarkMap, localiser: Localiser) -> None:
+        self._camera = camera.without_distortion()
+        self._config = config
+        self._map = landmarks
+        self._localiser = localiser
+
+    def insert(
+        self,
+        frame: Frame,
+        features: Features,
+        T_camera_world: Floats,
+        point_ids: Ints,
+        prediction: DepthPrediction,
+    ) -> MapKeyframe:
+        """Make ``frame`` a keyframe of the map and give birth to the points it sees anew."""
+        keyframe = MapKeyframe(
+            id=len(self._map.keyframes),
+            frame=frame,
+            features=features,
+            T_camera_world=T_camera_world.copy(),
+            point_ids=point_ids.copy(),
+            log_depth=np.full(len(features), np.nan),
+            sigma_log=np.full(len(features), np.nan),
+            prediction=prediction,
+        )
+        self._map.add_keyframe(keyframe)
+        self._give_birth(keyframe, prediction)
+        return keyframe
+
+    def _give_birth(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
+        features, config = keyframe.features, self._config.depth
+        log_map, sigma_map_full = log_depth_of(prediction)
+        log = sample(log_map, features.raw_px)
+        sigma = sample(sigma_map_full, features.raw_px)
+        if prediction.is_sensor:
+            keyframe.log_depth, keyframe.sigma_log = log, sigma
+            depth, sigma_birth = log, sigma
+        else:
+            field = self.depth_field(keyframe)
+            correction, sigma_birth = field.correction(
+                features.raw_px, np.nan_to_num(log), np.nan_to_num(sigma, nan=1.0)
+            )
+            keyframe.scale = float(np.exp(np.median(correction)))
+            depth = log + correction
+        free = keyframe.point_ids < 0
+        known = np.isfinite(depth)
+        inside = known & (depth > np.log(config.min_m)) & (depth < np.log(config.max_m))
+        born = np.flatnonzero(free & inside & (sigma_birth < config.max_sigma_log))
+        if not prediction.is_sensor:
+            keyframe.log_depth[born] = depth[born]
+            keyframe.sigma_log[born] = sigma_birth[born]
+        position_c = backproject(self._camera, features.px[born], np.exp(depth[born]))
+        T_world_camera = keyframe.T_world_camera
+        covariance_c = ray_covariance(
+            self._camera, features.px[born], position_c, sigma_birth[born], features.sigma_px[born]
+        )
+        R = T_world_camera[:3, :3]
+        self._map.add_points(
+            keyframe, born, transform(T_world_camera, position_c), R @ covariance_c @ R.T
+        )
+
+    def depth_field(self, keyframe: MapKeyframe) -> DepthField:
+        """The keyframe's prediction tied to the well-known points it sees."""
+        assert keyframe.prediction is not None
+        log_map, sigma_full = log_depth_of(keyframe.prediction)
+        seen = np.flatnonzero(keyframe.point_ids >= 0)
+        rows = keyframe.point_ids[seen]
+        multi = self._map.observations[rows] >= 2
+        seen, rows = seen[multi], rows[multi]
+        z = transform(keyframe.T_camera_world, self._map.position_w[rows])[:, 2]
+        ok = z > 0.05
+        seen, rows, z = seen[ok], rows[ok], z[ok]
+        raw = keyframe.features.raw_px[seen]
+        return fit_depth_field(
+            raw,
+            sample(log_map, raw),
+            sample(sigma_full, raw),
+            np.log(z),
+            self._map.sigma_along_ray(rows, keyframe.center_w),
+            width=self._camera.width,
+        )
+
+    def search_neighbours(self, keyframe: MapKeyframe, limit: int = 10) -> None:
+        """Find the keyframe's points in the keyframes around it, and merge what is one point.
+
+        For a freshly born point the search area is the stretch of its epipolar line that
+        its predicted depth allows; a hit is its first triangulation.
+        """
+        landmarks = self._map
+        own = keyframe.point_ids[keyframe.point_ids >= 0]
+        neighbours = [k for k in landmarks.covisible(own, limit + 1, minimum=8) if k != keyframe.id]
+        for k in neighbours:
+            other = landmarks.keyframes[k]
+            mine = np.unique(keyframe.point_ids[keyframe.point_ids >= 0])
+            seen_there = np.zeros(landmarks.size + 1, dtype=bool)
+            seen_there[other.point_ids] = True
+            seen_there[-1] = False
+            rows = mine[~seen_there[mine]]
+            visible = self._localiser.expected(other.T_camera_world, rows)
+            rows, at, _ = self._localiser.search(
+                visible, other.features, 2.5, 60.0, max_distance=50, ratio=0.75, sigmas=2.5
+            )
+            self._attach(other, rows, at)
+
+    def _attach(self, keyframe: MapKeyframe, rows: Ints, at: Ints) -> None:
+        landmarks = self._map
+        there = keyframe.point_ids[at]
+        free = there < 0
+        keyframe.point_ids[at[free]] = rows[free]
+        landmarks.observations[rows[free]] += 1
+        for mine, theirs in zip(rows[~free], there[~free], strict=True):
+            if mine == theirs or not (landmarks.alive[mine] and landmarks.alive[theirs]):
+                continue
+            if landmarks.observations[mine] > landmarks.observations[theirs]:
+                landmarks.merge(int(theirs), int(mine))
+            else:
+                landmarks.merge(int(mine), int(theirs))
+
+    def adjust_window(self, keyframe: MapKeyframe) -> BundleResult | None:
+        """Local bundle adjustment of the keyframe and those that see most of its points."""
+        landmarks, config = self._map, self._config.bundle
+        own = keyframe.point_ids[keyframe.point_ids >= 0]
+        window = landmarks.covisible(own, config.window, minimum=10)
+        if keyframe.id not in window:
+            window = [keyframe.id, *window[:-1]]
+        rows = landmarks.points_of(window)
+        rows = rows[landmarks.observations[rows] >= 2]
+        around = landmarks.shared_points(rows)
+        around[window] = 0
+        order = np.argsort(-around, kind="stable")[: config.fixed]
+        fixed = [int(k) for k in order if around[k] > 0]
+        return self.adjust(window, fixed, rows, (4, 5))
+
+    def adjust(
+        self, window: list[int], fixed: list[int], rows: Ints, iterations: tuple[int, ...]
+    ) -> BundleResult | None:
+        """Bundle adjustment of ``window`` held by ``fixed`` over the points ``rows``; updates the map."""
+        landmarks = self._map
+        used = sorted(window) + sorted(fixed)
+        index_of = np.full(landmarks.size + 1, -1, dtype=np.int64)
+        index_of[rows] = np.arange(len(rows))
+        index_of[-1] = -1
+        keyframes = [landmarks.keyframes[k] for k in used]
+        cams, feats = [], []
+        for i, k in enumerate(keyframes):
+            at = np.flatnonzero(index_of[k.point_ids] >= 0)
+            cams.append(np.full(len(at), i))
+            feats.append(at)
+        obs_camera, obs_feature = np.concatenate(cams), np.concatenate(feats)
+        if len(obs_camera) < 30:
+            return None
+        obs_point = np.concatenate(
+            [index_of[k.point_ids[at]] for k, at in zip(keyframes, feats, strict=True)]
+        )
+        is_fixed = np.array([k in set(fixed) or k == 0 for k in used])
+        if is_fixed.all():
+            return None
+        gather = [(k.features, k, at) for k, at in zip(keyframes, feats, strict=True)]
+        is_sensor = keyframes[0].prediction is not None and keyframes[0].prediction.is_sensor
+        problem = BundleProblem(
+            camera=self._camera,
+            T_camera_world=np.stack([k.T_camera_world for k in keyframes]),
+            fixed=is_fixed,
+            points_w=landmarks.position_w[rows].copy(),
+            obs_camera=obs_camera,
+            obs_point=obs_point,
+            px=np.concatenate([f.px[at] for f, _, at in gather]),
+            sigma_px=np.concatenate([f.sigma_px[at] for f, _, at in gather]),
+            log_depth=np.concatenate([k.log_depth[at] for _, k, at in gather]),
+            sigma_log=np.concatenate([k.sigma_log[at] for _, k, at in gather]),
+            sigma_scale=0.0 if is_sensor else self._config.bundle.scale_sigma,
+        )
+        result = bundle_adjust(problem, iterations)
+        self._take_over(keyframes, rows, result)
+        bad = ~result.inlier
+        landmarks.drop_observations(np.array(used)[obs_camera[bad]], obs_feature[bad])
+        return result
+
+    def _take_over(self, keyframes: list[MapKeyframe], rows: Ints, result: BundleResult) -> None:
+        landmarks = self._map
+        adjusted = np.zeros(landmarks.size, dtype=bool)
+        adjusted[rows] = True
+        for keyframe, T_new in zip(keyframes, result.T_camera_world, strict=True):
+            if np.array_equal(T_new, keyframe.T_camera_world):
+                continue
+            # points outside the adjustment ride along with the keyframe they were born in
+            riders = np.flatnonzero(
+                (landmarks.birth_keyframe[: landmarks.size] == keyframe.id)
+                & landmarks.alive[: landmarks.size]
+                & ~adjusted
+            )
+            motion = invert(T_new) @ keyframe.T_camera_world
+            landmarks.position_w[riders] = transform(motion, landmarks.position_w[riders])
+            R = motion[:3, :3]
+            landmarks.covariance_w[riders] = R @ landmarks.covariance_w[riders] @ R.T
+            keyframe.T_camera_world = T_new
+        landmarks.position_w[rows] = result.points_w
+        landmarks.covariance_w[rows] = result.covariance_w
+        self.refresh_views(rows)
+
+    def refresh_views(self, rows: Ints) -> None:
+        """Recompute from where, and from how far, points were first seen."""
+        landmarks = self._map
+        centers = np.stack([k.center_w for k in landmarks.keyframes])
+        offset = landmarks.position_w[rows] - centers[landmarks.birth_keyframe[rows]]
+        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
+        landmarks.distance_m[rows] = distance
+        landmarks.direction_w[rows] = offset / distance[:, None]
+
+    def cull(self, keyframe: MapKeyframe) -> None:
+        """Remove points that are seldom found where they should be."""
+        landmarks = self._map
+        n = landmarks.size
+        age = keyframe.id - landmarks.birth_keyframe[:n]
+        seldom = landmarks.found[:n] < 0.25 * landmarks.visible[:n]
+        lonely = (landmarks.observations[:n] < 2) & (age >= 3)
+        behind = landmarks.alive[:n] & ~np.isfinite(landmarks.position_w[:n]).all(axis=1)
+        landmarks.kill(np.flatnonzero(landmarks.alive[:n] & ((seldom & (age >= 1)) | lonely | behind)))
+
+
+def ray_covariance(
+    camera: Camera, px: Floats, position_c: Floats, sigma_log: Floats, sigma_px: Floats
+) -> Floats:
+    """``(N, 3, 3)`` covariance, camera frame, of points known by pixel and uncertain depth."""
+    z = position_c[:, 2]
+    along = position_c * sigma_log[:, None]
+    lateral = z * sigma_px / camera.fx
+    covariance = along[:, :, None] * along[:, None, :]
+    for axis in range(3):
+        covariance[:, axis, axis] += lateral**2
+    return covariance

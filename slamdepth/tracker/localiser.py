@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where is this frame? Matching a frame's features into the local map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.config import Config
+from slamdepth.frontend.features import Features
+from slamdepth.frontend.matching import best_matches, hamming, match_all, pairs_within
+from slamdepth.frontend.pose import pixel_covariance, pose_from_scratch, refine_pose
+from slamdepth.geometry import project, transform
+from slamdepth.mapping.landmarks import LandmarkMap
+from slamdepth.types import Camera
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+MAHALANOBIS_GATE = 9.21  # chi-square, 2 degrees of freedom, 99 %
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A frame placed in the map.
+
+    Attributes:
+        T_camera_world: ``(4, 4)``.
+        point_ids: ``(N,)`` map point each feature agrees with, -1 for none.
+        information: ``(6, 6)`` of the pose.
+    """
+
+    T_camera_world: Floats
+    point_ids: Ints
+    information: Floats
+
+    @property
+    def inliers(self) -> int:
+        return int(np.count_nonzero(self.point_ids >= 0))
+
+
+@dataclass(frozen=True)
+class Visible:
+    """Map points expected in an image: rows, pixels ``(N, 2)``, pixel covariances, octaves."""
+
+    rows: Ints
+    px: Floats
+    covariance_px: Floats
+    octave: Ints
+
+
+class Localiser:
+    """Places frames in a :class:`LandmarkMap`."""
+
+    def __init__(self, camera: Camera, config: Config, landmarks: LandmarkMap) -> None:
+        self._camera = camera.without_distortion()
+        self._config = config
+        self._map = landmarks
+
+    def expected(self, T_camera_world: Floats, rows: Ints) -> Visible:
+        """Which of the points ``rows`` a camera at ``T_camera_world`` should see, and where."""
+        camera, landmarks = self._camera, self._map
+        points_w = landmarks.position_w[rows]
+        points_c = transform(T_camera_world, points_w)
+        px, z = project(camera, points_c)
+        margin = 8.0
+        ok = (
+            (z > 0.05)
+            & (px[:, 0] > -margin)
+            & (px[:, 0] < camera.width + margin)
+            & (px[:, 1] > -margin)
+            & (px[:, 1] < camera.height + margin)
+        )
+        center_w = -T_camera_world[:3, :3].T @ T_camera_world[:3, 3]
+        offset = points_w - center_w
+        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
+        ok &= np.einsum("ni,ni->n", offset, landmarks.direction_w[rows]) > 0.5 * distance
+        step = np.log(landmarks.distance_m[rows] / distance) / np.log(self._config.features.scale_factor)
+        octave = np.rint(landmarks.octave[rows] + step).astype(np.int64)
+        ok &= (octave >= -1) & (octave <= self._config.features.levels)
+        at = np.flatnonzero(ok)
+        covariance = pixel_covariance(
+            camera, T_camera_world, points_c[at], landmarks.covariance_w[rows[at]], np.zeros(len(at))
+        )
+        octave = np.clip(octave[at], 0, self._config.features.levels - 1)
+        return Visible(rows[at], px[at], covariance, octave)
+
+    def search(
+        self,
+        visible: Visible,
+        features: Features,
+        radius_px: float,
+        max_px: float,
+        *,
+        max_distance: int = 64,
+        ratio: float = 0.85,
+        sigmas: float = 3.0,
+    ) -> tuple[Ints, Ints, Ints]:
+        """Match expected points to features; the search area follows each point's uncertainty.
+
+        Args:
+            radius_px: error of the pose alone, in pixels of the finest level.
+            max_px: no search goes farther.
+
+        Returns:
+            ``(map rows, feature indices, Hamming distances)``, one to one.
+        """
+        octave_scale = self._config.features.scale_factor ** visible.octave.astype(np.float64)
+        S = visible.covariance_px
+        half_trace = 0.5 * (S[:, 0, 0] + S[:, 1, 1])
+        largest = half_trace + np.sqrt(
+            np.maximum(half_trace**2 - (S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2), 0.0)
+        )
+        reach = np.minimum(radius_px * octave_scale + sigmas * np.sqrt(largest), max_px)
+        q, t = pairs_within(visible.px, reach, features.px)
+        step = features.octave[t] - visible.octave[q]
+        ok = (step >= -1) & (step <= 1)
+        q, t = q[ok], t[ok]
+        # the ellipse: the pose's error plus the point's own
+        base = (radius_px * octave_scale[q]) ** 2 / MAHALANOBIS_GATE
+        a, b, c = S[q, 0, 0] + base, S[q, 0, 1], S[q, 1, 1] + base
+        d = features.px[t] - visible.px[q]
+        square = (c * d[:, 0] ** 2 - 2 * b * d[:, 0] * d[:, 1] + a * d[:, 1] ** 2) / (a * c - b * b)
+        ok = square < MAHALANOBIS_GATE
+        q, t = q[ok], t[ok]
+        distance = hamming(self._map.descriptor[visible.rows[q]], features.descriptors[t])
+        q, t, distance = best_matches(q, t, distance, max_distance=max_distance, ratio=ratio)
+        return visible.rows[q], t, distance
+
+    def track(
+        self,
+        features: Features,
+        T_guess: Floats,
+        recent_rows: Ints,
+        *,
+        log_depth: Floats | None = None,
+        sigma_log: Floats | None = None,
+    ) -> Placement | None:
+        """Place a frame near ``T_guess`` (camera from world); None where it does not hold."""
+        start = self._near(features, T_guess, recent_rows, log_depth, sigma_log)
+        if start is None:
+            return None
+        return self.refine_in_local_map(features, start, log_depth=log_depth, sigma_log=sigma_log)
+
+    def _near(
+        self,
+        features: Features,
+        T_guess: Floats,
+        rows: Ints,
+        log_depth: Floats | None,
+        sigma_log: Floats | None,
+    ) -> Placement | None:
+        visible = self.expected(T_guess, rows)
+        need = self._config.tracking.min_inliers
+        for radius in (12.0, 30.0, 70.0):
+            found, at, _ = self.search(visible, features, radius, max(40.0, 1.5 * radius))
+            if len(found) < need:
+                continue
+            placement = self._solve(features, T_guess, found, at, log_depth, sigma_log)
+            if placement.inliers >= max(need, 0.4 * len(found)):
+                return placement
+        return None
+
+    def refine_in_local_map(
+        self,
+        features: Features,
+        start: Placement,
+        *,
+        log_depth: Floats | None = None,
+        sigma_log: Floats | None = None,
+    ) -> Placement | None:
+        """Search the whole neighbourhood of a first placement and place the frame by all of it."""
+        rows = self.local_rows(start.point_ids)
+        visible = self.expected(start.T_camera_world, rows)
+        found, at, _ = self.search(visible, features, 4.0, 30.0)
+        if len(found) < self._config.tracking.min_inliers:
+            return None
+        placement = self._solve(features, start.T_camera_world, found, at, log_depth, sigma_log)
+        self._map.visible[visible.rows] += 1
+        inlier_rows = placement.point_ids[placement.point_ids >= 0]
+        self._map.found[inlier_rows] += 1
+        if placement.inliers < self._config.tracking.min_inliers:
+            return None
+        return placement
+
+    def local_rows(self, point_ids: Ints) -> Ints:
+        """Points of the keyframes that see what the frame sees."""
+        seeds = point_ids[point_ids >= 0]
+        return self._map.points_of(self._map.covisible(seeds, self._config.tracking.local_keyframes))
+
+    def _solve(
+        self,
+        features: Features,
+        T_start: Floats,
+        rows: Ints,
+        at: Ints,
+        log_depth: Floats | None,
+        sigma_log: Floats | None,
+    ) -> Placement:
+        estimate = refine_pose(
+            self._camera,
+            T_start,
+            self._map.position_w[rows],
+            self._map.covariance_w[rows],
+            features.px[at],
+            features.sigma_px[at],
+            log_depth=None if log_depth is None else log_depth[at],
+            sigma_log=None if sigma_log is None else sigma_log[at],
+        )
+        point_ids = np.full(len(features), -1, dtype=np.int64)
+        point_ids[at[estimate.inliers]] = rows[estimate.inliers]
+        return Placement(estimate.T_camera_world, point_ids, estimate.information)
+
+    def from_keyframe(self, features: Features, keyframe_id: int, *, minimum: int | None = None) -> Placement | None:
+        """Place a frame by matching it with one keyframe, without knowing where it is."""
+        need = self._config.tracking.min_inliers if minimum is None else minimum
+        keyframe = self._map.keyframes[keyframe_id]
+        has = np.flatnonzero(keyframe.point_ids >= 0)
+        if len(has) < need:
+            return None
+        a, b, _ = match_all(keyframe.features.descriptors[has], features.descriptors, ratio=0.85)
+        rows = keyframe.point_ids[has[a]]
+        solution = pose_from_scratch(
+            self._camera, self._map.position_w[rows], features.px[b], seed=self._config.seed, minimum=max(8, need // 2)
+        )
+        if solution is None:
+            return None
+        T, inliers = solution
+        start = self._solve(features, T, rows[inliers], b[inliers], None, None)
+        if start.inliers < max(8, need // 2):
+            return None
+        return self.refine_in_local_map(features, start)
