@@ -1,2 +1,130 @@
 # SPDX-License-Identifier: Apache-2.0
-"""slamdepth: one camera in, a metric trajectory and a mesh out."""
+"""slamdepth: one camera in, a metric trajectory and a mesh out.
+
+Names are imported when they are first used, so that ``import slamdepth`` costs next to
+nothing.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from slamdepth.config import Config
+    from slamdepth.datasets import Dataset, open_dataset
+    from slamdepth.depth.base import DepthModel
+    from slamdepth.depth.registry import create_depth_model
+    from slamdepth.errors import (
+        CameraError,
+        ConfigError,
+        DatasetError,
+        ImageDecodeError,
+        InputError,
+        OutputError,
+        SlamdepthError,
+        TrackingError,
+        WeightsError,
+    )
+    from slamdepth.evaluation import score_trajectory
+    from slamdepth.io import read_tum_trajectory, write_tum_trajectory
+    from slamdepth.tracker import Tracker, create_tracker
+    from slamdepth.types import (
+        Camera,
+        DepthKind,
+        DepthPrediction,
+        Frame,
+        Keyframe,
+        Reconstruction,
+        StepResult,
+        TrackingStatus,
+        Trajectory,
+        WeightsInfo,
+    )
+
+_HOME = {
+    "Camera": "slamdepth.types",
+    "CameraError": "slamdepth.errors",
+    "Config": "slamdepth.config",
+    "ConfigError": "slamdepth.errors",
+    "Dataset": "slamdepth.datasets",
+    "DatasetError": "slamdepth.errors",
+    "DepthKind": "slamdepth.types",
+    "DepthModel": "slamdepth.depth.base",
+    "DepthPrediction": "slamdepth.types",
+    "Frame": "slamdepth.types",
+    "ImageDecodeError": "slamdepth.errors",
+    "InputError": "slamdepth.errors",
+    "Keyframe": "slamdepth.types",
+    "OutputError": "slamdepth.errors",
+    "Reconstruction": "slamdepth.types",
+    "SlamdepthError": "slamdepth.errors",
+    "StepResult": "slamdepth.types",
+    "Tracker": "slamdepth.tracker",
+    "TrackingError": "slamdepth.errors",
+    "TrackingStatus": "slamdepth.types",
+    "Trajectory": "slamdepth.types",
+    "WeightsError": "slamdepth.errors",
+    "WeightsInfo": "slamdepth.types",
+    "create_depth_model": "slamdepth.depth.registry",
+    "create_tracker": "slamdepth.tracker",
+    "open_dataset": "slamdepth.datasets",
+    "read_tum_trajectory": "slamdepth.io",
+    "score_trajectory": "slamdepth.evaluation",
+    "write_tum_trajectory": "slamdepth.io",
+}
+
+__all__ = [
+    "Camera",
+    "CameraError",
+    "Config",
+    "ConfigError",
+    "Dataset",
+    "DatasetError",
+    "DepthKind",
+    "DepthModel",
+    "DepthPrediction",
+    "Frame",
+    "ImageDecodeError",
+    "InputError",
+    "Keyframe",
+    "OutputError",
+    "Reconstruction",
+    "SlamdepthError",
+    "StepResult",
+    "Tracker",
+    "TrackingError",
+    "TrackingStatus",
+    "Trajectory",
+    "WeightsError",
+    "WeightsInfo",
+    "__version__",
+    "create_depth_model",
+    "create_tracker",
+    "open_dataset",
+    "read_tum_trajectory",
+    "score_trajectory",
+    "write_tum_trajectory",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        import importlib
+
+        return getattr(importlib.import_module(_HOME[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _be_silent_unless_asked() -> None:
+    import logging
+
+    logging.getLogger(__name__).addHandler(logging.NullHandler())
+
+
+_be_silent_unless_asked()

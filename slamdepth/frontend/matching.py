@@ -40,12 +40,28 @@ def pairs_within(query_px: Floats, radius_px: Floats, px: Floats) -> tuple[Ints,
         query_px: ``(M, 2)``, radius_px: ``(M,)``, px: ``(N, 2)``; pixels.
 
     Returns:
-        Two index arrays of equal length, grouped by nothing in particular.
+        Two index arrays of equal length, in no particular order.
     """
     empty = np.zeros(0, dtype=np.int64)
     if len(query_px) == 0 or len(px) == 0:
         return empty, empty
-    cell = max(float(radius_px.max()), 8.0)
+    # one grid for each range of radii: a few far searches must not make all cells large
+    parts = []
+    lower = 0.0
+    for upper in (12.0, 30.0, np.inf):
+        chosen = np.flatnonzero((radius_px > lower) & (radius_px <= upper))
+        lower = upper
+        if len(chosen):
+            q, t = _pairs_in_grid(query_px[chosen], radius_px[chosen], px)
+            parts.append((chosen[q], t))
+    if not parts:
+        return empty, empty
+    return np.concatenate([q for q, _ in parts]), np.concatenate([t for _, t in parts])
+
+
+def _pairs_in_grid(query_px: Floats, radius_px: Floats, px: Floats) -> tuple[Ints, Ints]:
+    """:func:`pairs_within` over square cells of the largest radius: three rows of cells hold all."""
+    cell = float(radius_px.max())
     low = px.min(axis=0)
     target_cell = np.floor((px - low) / cell).astype(np.int64) + 1
     columns, rows = target_cell[:, 0].max() + 3, target_cell[:, 1].max() + 3
@@ -73,8 +89,8 @@ def pairs_within(query_px: Floats, radius_px: Floats, px: Floats) -> tuple[Ints,
         queries.append(np.repeat(q, length))
         targets.append(order[offset + np.repeat(begin, length)])
     q, t = np.concatenate(queries), np.concatenate(targets)
-    delta = query_px[q] - px[t]
-    near = np.einsum("ij,ij->i", delta, delta) <= radius_px[q] ** 2
+    du, dv = query_px[q, 0] - px[t, 0], query_px[q, 1] - px[t, 1]
+    near = du * du + dv * dv <= radius_px[q] ** 2
     return q[near], t[near]
 
 

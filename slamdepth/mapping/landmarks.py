@@ -127,6 +127,14 @@ class LandmarkMap:
         self.keyframes.append(keyframe)
         self.observations[keyframe.point_ids[keyframe.point_ids >= 0]] += 1
 
+    def refresh_views(self, rows: Ints) -> None:
+        """Recompute from where, and from how far, points were first seen, after anything moved."""
+        centers = np.stack([k.center_w for k in self.keyframes])
+        offset = self.position_w[rows] - centers[self.birth_keyframe[rows]]
+        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
+        self.distance_m[rows] = distance
+        self.direction_w[rows] = offset / distance[:, None]
+
     def resolve(self, rows: Ints) -> Ints:
         """Rows after merges and deaths: -1 where the point is gone."""
         out = rows.copy()
@@ -140,21 +148,36 @@ class LandmarkMap:
         out[known] = np.where(self.alive[target], target, -1)
         return out
 
-    def merge(self, loser: int, winner: int) -> None:
-        """Let ``winner`` take over what ``loser`` is seen by."""
+    def merge(self, losers: Ints, winners: Ints) -> None:
+        """Let each of ``winners`` take over what the point ``losers`` at the same place was seen by.
+
+        A point occurs on one side only; several losers may share a winner. A keyframe that
+        sees both keeps the winner's keypoint.
+        """
+        if len(losers) == 0:
+            return
+        target = np.arange(self.size)
+        target[losers] = winners
         for keyframe in self.keyframes:
-            at = np.flatnonzero(keyframe.point_ids == loser)
-            if len(at) == 0:
+            ids = keyframe.point_ids
+            at = np.flatnonzero(ids >= 0)
+            moved = at[target[ids[at]] != ids[at]]
+            if len(moved) == 0:
                 continue
-            if np.any(keyframe.point_ids == winner):
-                keyframe.point_ids[at] = -1
-            else:
-                keyframe.point_ids[at] = winner
-                self.observations[winner] += 1
-        self.alive[loser] = False
-        self.alias[loser] = winner
-        self.visible[winner] += self.visible[loser]
-        self.found[winner] += self.found[loser]
+            taken = np.zeros(self.size, dtype=bool)
+            taken[ids[at]] = True
+            for feature in moved:
+                winner = target[ids[feature]]
+                if taken[winner]:
+                    ids[feature] = -1
+                else:
+                    taken[winner] = True
+                    ids[feature] = winner
+                    self.observations[winner] += 1
+        self.alive[losers] = False
+        self.alias[losers] = winners
+        np.add.at(self.visible, winners, self.visible[losers])
+        np.add.at(self.found, winners, self.found[losers])
 
     def kill(self, rows: Ints) -> None:
         """Remove points from the map and from every keyframe."""

@@ -1,1 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
+"""What a run ends with: ``report.json``, ``report.html`` and tables for the terminal."""
+
+from __future__ import annotations
+
+from slamdepth.report.console import depth_table, run_table, trajectory_table
+from slamdepth.report.data import MeshCounts, ReportData
+from slamdepth.report.html import build_html
+from slamdepth.report.summary import build_summary
+from slamdepth.report.write import write_report
+
+__all__ = [
+    "MeshCounts",
+    "ReportData",
+    "build_html",
+    "build_summary",
+    "depth_table",
+    "run_table",
+    "trajectory_table",
+    "write_report",
+]

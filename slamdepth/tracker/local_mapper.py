@@ -136,13 +136,11 @@ class LocalMapper:
         free = there < 0
         keyframe.point_ids[at[free]] = rows[free]
         landmarks.observations[rows[free]] += 1
-        for mine, theirs in zip(rows[~free], there[~free], strict=True):
-            if mine == theirs or not (landmarks.alive[mine] and landmarks.alive[theirs]):
-                continue
-            if landmarks.observations[mine] > landmarks.observations[theirs]:
-                landmarks.merge(int(theirs), int(mine))
-            else:
-                landmarks.merge(int(mine), int(theirs))
+        mine, theirs = rows[~free], there[~free]
+        alive = (mine != theirs) & landmarks.alive[mine] & landmarks.alive[theirs]
+        mine, theirs = mine[alive], theirs[alive]
+        stronger = landmarks.observations[mine] > landmarks.observations[theirs]
+        landmarks.merge(np.where(stronger, theirs, mine), np.where(stronger, mine, theirs))
 
     def adjust_window(self, keyframe: MapKeyframe) -> BundleResult | None:
         """Local bundle adjustment of the keyframe and those that see most of its points."""
@@ -224,16 +222,7 @@ class LocalMapper:
             keyframe.T_camera_world = T_new
         landmarks.position_w[rows] = result.points_w
         landmarks.covariance_w[rows] = result.covariance_w
-        self.refresh_views(rows)
-
-    def refresh_views(self, rows: Ints) -> None:
-        """Recompute from where, and from how far, points were first seen."""
-        landmarks = self._map
-        centers = np.stack([k.center_w for k in landmarks.keyframes])
-        offset = landmarks.position_w[rows] - centers[landmarks.birth_keyframe[rows]]
-        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
-        landmarks.distance_m[rows] = distance
-        landmarks.direction_w[rows] = offset / distance[:, None]
+        landmarks.refresh_views(rows)
 
     def cull(self, keyframe: MapKeyframe) -> None:
         """Remove points that are seldom found where they should be."""

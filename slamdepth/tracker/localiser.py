@@ -188,6 +188,14 @@ class Localiser:
             return None
         return placement
 
+    def attach(self, features: Features, placement: Placement, rows: Ints) -> Placement:
+        """Find what a frame whose pose is known otherwise sees of the points ``rows``; the pose stays."""
+        visible = self.expected(placement.T_camera_world, rows)
+        found, at, _ = self.search(visible, features, 6.0, 30.0)
+        point_ids = np.full(len(features), -1, dtype=np.int64)
+        point_ids[at] = found
+        return Placement(placement.T_camera_world, point_ids, placement.information)
+
     def local_rows(self, point_ids: Ints) -> Ints:
         """Points of the keyframes that see what the frame sees."""
         seeds = point_ids[point_ids >= 0]

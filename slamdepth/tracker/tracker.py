@@ -8,169 +8,301 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
-from slamdepth.errors import TrackingError
+from slamdepth.depth.registry import create_depth_model
+from slamdepth.errors import CameraError, TrackingError
 from slamdepth.frontend.features import Features, create_extractor
 from slamdepth.geometry import invert, so3_exp, so3_log
 from slamdepth.mapping.landmarks import LandmarkMap
+from slamdepth.tracker.finish import build_reconstruction, optimise_everything
+from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Localiser, Placement
-from slamdepth.types import Camera, Frame, StepResult, TrackingStatus
+from slamdepth.tracker.loop_closer import LoopCloser
+from slamdepth.tracker.rescue import CloudRescue
+from slamdepth.tracker.threads import one_blas_thread
+from slamdepth.types import Camera, DepthPrediction, Frame, Reconstruction, StepResult, TrackingStatus
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
 
 log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class _Placed:
-    """An ordinary frame, kept relative to a keyframe so that it moves with it."""
-
-    index: int
-    timestamp_s: float
-    keyframe: int
-    T_camera_keyframe: NDArray[np.float64]
+_MAX_EXTRAPOLATION = 3.0  # frame intervals the constant velocity is believed for
+_RELOCALISATION_CANDIDATES = 4
 
 
 class Tracker:
-    def __init__(self, camera: Camera, depth_model: DepthModel, config: Config | None = None) -> None:
+    """Monocular SLAM with a depth prior: feed frames to :meth:`step`, then :meth:`finish`.
+
+    Example:
+        >>> tracker = Tracker(camera, depth_model=create_depth_model("dinov2"))  # doctest: +SKIP
+        >>> for frame in frames:  # doctest: +SKIP
+        ...     result = tracker.step(frame)
+        >>> reconstruction = tracker.finish()  # doctest: +SKIP
+
+    Args:
+        camera: the camera of every frame.
+        depth_model: where the depth of keyframes comes from; None builds the one that
+            ``config.depth.name`` names.
+        config: settings; None takes the defaults.
+
+    Raises:
+        ConfigError: a feature or depth model of that name does not exist.
+        WeightsError: the depth model's weights are not there.
+    """
+
+    def __init__(
+        self, camera: Camera, depth_model: DepthModel | None = None, config: Config | None = None
+    ) -> None:
         self.camera = camera
         self.config = config or Config()
-        self._depth_model = depth_model
+        self._depth_model = depth_model or create_depth_model(
+            self.config.depth.name, device=self.config.device, seed=self.config.seed
+        )
         self._extractor = create_extractor(self.config.features)
-        self.map = LandmarkMap()
-        self._localiser = Localiser(camera, self.config, self.map)
-        self._mapper = LocalMapper(camera, self.config, self.map, self._localiser)
-        self.placed: list[_Placed] = []
+        self._map = LandmarkMap()
+        self._localiser = Localiser(camera, self.config, self._map)
+        self._mapper = LocalMapper(camera, self.config, self._map, self._localiser)
+        self._loops = LoopCloser(self.config, self._map, self._localiser)
+        self._rescue = CloudRescue(camera, self.config, self._map)
+        self._log = FrameLog(camera, self._map)
         self._last: Placement | None = None
-        self._velocity = np.eye(4)
-        self._last_time_s = 0.0
-        self._last_dt_s = 0.0
+        self._velocity = np.eye(4)  # T_camera(now)_camera(before)
+        self._last_time_s = -np.inf
+        self._last_step_s = 0.0
         self._reference_overlap = 0
-        self._totals: dict[str, list[float]] = defaultdict(list)
+        self._frames = 0
+        self._relocalisations = 0
+        self._rescues = 0
+        self._finished = False
         self._timings: dict[str, float] = {}
-        self.frames = 0
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        ms = (time.perf_counter() - start) * 1e3
-        self._timings[stage] = self._timings.get(stage, 0.0) + ms
-        self._totals[stage].append(ms)
+        self._totals: dict[str, list[float]] = defaultdict(list)
 
     def step(self, frame: Frame) -> StepResult:
+        """Place the next frame.
+
+        Args:
+            frame: later than all before; taken by ``self.camera``.
+
+        Returns:
+            Its pose and what was done; ``T_world_camera`` is None where it was lost.
+
+        Raises:
+            TrackingError: the tracker has finished, or time does not increase.
+            CameraError: the frame was taken by another camera.
+        """
+        self._check(frame)
+        self._timings = {}
+        with one_blas_thread():
+            result = self._step(frame)
+        self._last_time_s = frame.timestamp_s
+        return result
+
+    def _check(self, frame: Frame) -> None:
+        if self._finished:
+            raise TrackingError("this tracker has finished; make a new one for another sequence")
+        if not frame.timestamp_s > self._last_time_s:
+            raise TrackingError(
+                f"frame {frame.index}: time must increase, got {frame.timestamp_s} s "
+                f"after {self._last_time_s} s"
+            )
+        if frame.camera != self.camera:
+            raise CameraError(f"frame {frame.index} was taken by another camera than the tracker's")
+
+    def _step(self, frame: Frame) -> StepResult:
         import cv2
 
-        self._timings = {}
-        if self.frames and frame.timestamp_s <= self._last_time_s:
-            raise TrackingError("timestamps must increase")
-        self.frames += 1
+        self._frames += 1
         with self._timed("features"):
             gray = cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)
             features = self._extractor.extract(gray, self.camera)
-        is_keyframe = False
-        status = TrackingStatus.TRACKING
-        if not self.map.keyframes:
-            placement = Placement(np.eye(4), np.full(len(features), -1), np.eye(6))
-            is_keyframe = True
-        else:
-            with self._timed("tracking"):
-                placement = self._track(frame, features)
-            if placement is None:
-                self._last_time_s = frame.timestamp_s
-                self._last = None
-                return StepResult(frame.index, frame.timestamp_s, TrackingStatus.LOST, None, timings_ms=self._timings)
-            is_keyframe = self._wants_keyframe(placement)
+        if not self._map.keyframes:
+            return self._start(frame, features)
+        with self._timed("tracking"):
+            placement, status = self._place(frame, features)
+        if placement is None:
+            self._last = None
+            return self._result(frame, TrackingStatus.LOST, None, False)
+        is_keyframe = self._wants_keyframe(placement) and self._can_be_keyframe(frame)
         if is_keyframe:
+            before = placement
             placement = self._make_keyframe(frame, features, placement)
-        self._remember(frame, placement, is_keyframe)
+            self._remember_motion(frame, before, placement)
+        else:
+            self._remember_motion(frame, placement, placement)
+        self._log.add(frame.timestamp_s, features, placement, is_keyframe)
+        return self._result(frame, status, placement, is_keyframe)
+
+    def _start(self, frame: Frame, features: Features) -> StepResult:
+        if len(features) < self.config.tracking.min_inliers or not self._can_be_keyframe(frame):
+            return self._result(frame, TrackingStatus.INITIALISING, None, False)
+        empty = Placement(np.eye(4), np.full(len(features), -1, dtype=np.int64), np.eye(6))
+        placement = self._make_keyframe(frame, features, empty)
+        self._remember_motion(frame, placement, placement)
+        self._log.add(frame.timestamp_s, features, placement, True)
+        return self._result(frame, TrackingStatus.TRACKING, placement, True)
+
+    def _result(
+        self, frame: Frame, status: TrackingStatus, placement: Placement | None, is_keyframe: bool
+    ) -> StepResult:
         return StepResult(
-            frame.index,
-            frame.timestamp_s,
-            status,
-            invert(placement.T_camera_world),
-            placement.inliers,
-            is_keyframe,
-            len(self.map.keyframes),
-            0,
-            self._timings,
+            index=frame.index,
+            timestamp_s=frame.timestamp_s,
+            status=status,
+            T_world_camera=None if placement is None else invert(placement.T_camera_world),
+            inliers=0 if placement is None else placement.inliers,
+            is_keyframe=is_keyframe,
+            keyframes=len(self._map.keyframes),
+            loop_closures=self._loops.count,
+            timings_ms=self._timings,
         )
 
-    def _track(self, frame: Frame, features: Features) -> Placement | None:
-        dt = frame.timestamp_s - self._last_time_s
+    def _place(self, frame: Frame, features: Features) -> tuple[Placement | None, TrackingStatus]:
         if self._last is not None:
-            ratio = dt / self._last_dt_s if self._last_dt_s > 0 else 1.0
-            T_guess = _scaled_motion(self._velocity, min(ratio, 3.0)) @ self._last.T_camera_world
-            rows = self.map.resolve(self._last.point_ids)
-            rows = np.unique(rows[rows >= 0])
-            placement = self._localiser.track(features, T_guess, rows)
+            T_guess = self._predicted(frame, self._last)
+            rows = self._map.resolve(self._last.point_ids)
+            placement = self._localiser.track(features, T_guess, np.unique(rows[rows >= 0]))
             if placement is not None:
-                return placement
-        for k in (len(self.map.keyframes) - 1,):
-            placement = self._localiser.from_keyframe(features, k)
+                return placement, TrackingStatus.TRACKING
+            placement = self._localiser.from_keyframe(features, len(self._map.keyframes) - 1)
             if placement is not None:
-                return placement
-        for k in range(len(self.map.keyframes) - 2, -1, -1):
-            placement = self._localiser.from_keyframe(features, k, minimum=30)
+                return placement, TrackingStatus.TRACKING
+            placement = self._register(frame, features, T_guess)
+            if placement is not None:
+                self._rescues += 1
+                return placement, TrackingStatus.RESCUED
+        placement = self._relocalise(features)
+        if placement is not None:
+            self._relocalisations += 1
+            return placement, TrackingStatus.RELOCALISED
+        return None, TrackingStatus.LOST
+
+    def _predicted(self, frame: Frame, last: Placement) -> Floats:
+        """``T_camera_world`` at constant velocity."""
+        ratio = (frame.timestamp_s - self._last_time_s) / self._last_step_s if self._last_step_s > 0 else 1.0
+        ratio = min(ratio, _MAX_EXTRAPOLATION)
+        motion = np.eye(4)
+        motion[:3, :3] = so3_exp(so3_log(self._velocity[:3, :3]) * ratio)
+        motion[:3, 3] = self._velocity[:3, 3] * ratio
+        return motion @ last.T_camera_world
+
+    def _relocalise(self, features: Features) -> Placement | None:
+        answers = self._loops.places.query(features.descriptors, top_k=_RELOCALISATION_CANDIDATES)
+        newest = len(self._map.keyframes) - 1
+        for k in dict.fromkeys([newest, *(k for k, _ in answers)]):
+            placement = self._localiser.from_keyframe(
+                features, k, minimum=self.config.loops.min_inliers if k != newest else None
+            )
             if placement is not None:
                 return placement
         return None
 
+    def _register(self, frame: Frame, features: Features, T_guess: Floats) -> Placement | None:
+        if not self._can_be_keyframe(frame):
+            return None
+        T = self._rescue.place(self._predict_depth(frame), T_guess)
+        if T is None:
+            return None
+        log.info("frame %d: too few features match; placed by registration of its depth", frame.index)
+        empty = Placement(T, np.full(len(features), -1, dtype=np.int64), np.eye(6))
+        recent = self._map.points_of([k.id for k in self._map.keyframes[-self.config.tracking.local_keyframes :]])
+        return self._localiser.attach(features, empty, recent)
+
+    def _can_be_keyframe(self, frame: Frame) -> bool:
+        """A sensor may have no depth for a frame; a network always has."""
+        return self._depth_model.name != "sensor" or frame.depth_m is not None
+
+    def _predict_depth(self, frame: Frame) -> DepthPrediction:
+        with self._timed("depth"):
+            return self._depth_model.predict(frame)
+
     def _wants_keyframe(self, placement: Placement) -> bool:
-        reference = self.map.keyframes[-1]
-        seen = np.zeros(self.map.size + 1, dtype=bool)
+        """The view has moved on when much of what the last keyframe saw is seen no more."""
+        reference = self._map.keyframes[-1]
+        seen = np.zeros(self._map.size + 1, dtype=bool)
         seen[placement.point_ids] = True
         seen[-1] = False
         still = int(np.count_nonzero(seen[reference.point_ids]))
         self._reference_overlap = max(self._reference_overlap, still)
-        config = self.config.tracking
-        return still < config.keyframe_overlap * self._reference_overlap or (
-            placement.inliers < config.keyframe_min_inliers and still < 0.9 * self._reference_overlap
-        )
+        tracking = self.config.tracking
+        if placement.inliers < tracking.min_inliers:
+            return True
+        if still < tracking.keyframe_overlap * self._reference_overlap:
+            return True
+        return placement.inliers < tracking.keyframe_min_inliers and still < 0.9 * self._reference_overlap
 
     def _make_keyframe(self, frame: Frame, features: Features, placement: Placement) -> Placement:
-        with self._timed("depth"):
-            prediction = self._depth_model.predict(frame)
+        prediction = self._predict_depth(frame)
         with self._timed("mapping"):
             keyframe = self._mapper.insert(
                 frame, features, placement.T_camera_world, placement.point_ids, prediction
             )
-            if keyframe.id:
-                self._mapper.search_neighbours(keyframe)
-        if keyframe.id:
+            self._mapper.search_neighbours(keyframe)
+        with self._timed("bundle"):
+            self._mapper.adjust_window(keyframe)
+        with self._timed("loops"):
+            self._loops.add(keyframe)
+            correction = self._loops.close(keyframe)
+        if correction is not None:
+            self._log.rescale(correction.scales)
             with self._timed("bundle"):
+                self._mapper.search_neighbours(keyframe)
                 self._mapper.adjust_window(keyframe)
+        with self._timed("mapping"):
             self._mapper.cull(keyframe)
         self._reference_overlap = 0
         return Placement(keyframe.T_camera_world.copy(), keyframe.point_ids.copy(), placement.information)
 
-    def _remember(self, frame: Frame, placement: Placement, is_keyframe: bool) -> None:
+    def _remember_motion(self, frame: Frame, measured: Placement, final: Placement) -> None:
+        """Velocity from the pose as measured, so that a correction of the map is not taken for motion."""
         if self._last is not None:
-            self._velocity = placement.T_camera_world @ invert(self._last_T)
-            self._last_dt_s = frame.timestamp_s - self._last_time_s
+            self._velocity = measured.T_camera_world @ invert(self._last.T_camera_world)
+            self._last_step_s = frame.timestamp_s - self._last_time_s
         else:
             self._velocity = np.eye(4)
-        self._last, self._last_time_s = placement, frame.timestamp_s
-        self._last_T = placement.T_camera_world
-        k = self.map.keyframes[-1]
-        self.placed.append(
-            _Placed(frame.index, frame.timestamp_s, k.id, placement.T_camera_world @ k.T_world_camera)
+        self._last = final
+
+    def finish(self) -> Reconstruction:
+        """Adjust the whole map, make it metric, place every frame in it, and hand it over.
+
+        Raises:
+            TrackingError: it was called before, or no frame could be placed.
+        """
+        if self._finished:
+            raise TrackingError("this tracker has finished already")
+        if not self._map.keyframes:
+            raise TrackingError("no frame could be placed: too few features, or no depth")
+        self._finished = True
+        self._timings = {}
+        with one_blas_thread(), self._timed("final"):
+            notes = optimise_everything(self._map, self._mapper, self._log, self.config)
+        mean = {stage: float(np.mean(values)) for stage, values in self._totals.items()}
+        return build_reconstruction(
+            self._map,
+            self._mapper,
+            self._log,
+            frames_total=self._frames,
+            loop_closures=self._loops.count,
+            relocalisations=self._relocalisations,
+            rescues=self._rescues,
+            timings_ms=mean,
+            notes=notes,
         )
 
-
-def _scaled_motion(T: Floats, ratio: float) -> Floats:
-    out = np.eye(4)
-    out[:3, :3] = so3_exp(so3_log(T[:3, :3]) * ratio)
-    out[:3, 3] = T[:3, 3] * ratio
-    return out
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            ms = (time.perf_counter() - start) * 1e3
+            self._timings[stage] = self._timings.get(stage, 0.0) + ms
+            self._totals[stage].append(ms)

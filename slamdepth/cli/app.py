@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All commands together, and how errors end a process.
+
+Exit codes: 0 done (also for a run that was interrupted and finished with what it had),
+1 failed, 2 the input or the command line is wrong, 130 interrupted with nothing to save.
+Modules that take long to import are imported inside the commands.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from slamdepth.cli import evaluate, run, synth, train, weights
+from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_verbose
+from slamdepth.errors import SlamdepthError
+
+# typer carries its own copy of click since 0.26 and uses click before: the name is found, not imported.
+_UsageProblem: type[Any] = next(
+    cls for cls in typer.BadParameter.__mro__ if cls.__name__ == "ClickException"
+)
+
+app = typer.Typer(
+    name="slamdepth",
+    help="One camera in, a metric trajectory and a mesh out.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("run")(run.run_command)
+app.command("synth")(synth.synth_command)
+app.command("evaluate")(evaluate.evaluate_command)
+app.command("eval-depth")(train.eval_depth_command)
+app.command("train-depth")(train.train_depth_command)
+app.add_typer(weights.app, name="weights")
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from slamdepth import __version__
+
+        typer.echo(f"slamdepth {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _everything(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+    verbose: VerboseOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """One camera in, a metric trajectory and a mesh out.
+
+    Start with: slamdepth synth room, then slamdepth run room --depth sensor
+    """
+
+
+def main() -> NoReturn:
+    """Run the command line; errors made on purpose end in one line on standard error."""
+    try:
+        code = app(standalone_mode=False)
+    except SlamdepthError as error:
+        _tell(str(error))
+        code = error.exit_code
+    except _UsageProblem as problem:
+        # typer shows the help itself where no command is given; its message is then empty.
+        if message := problem.format_message():
+            command = getattr(getattr(problem, "ctx", None), "command_path", None) or "slamdepth"
+            _tell(f"{message} (see '{command} --help')")
+        code = problem.exit_code
+    except (KeyboardInterrupt, typer.Abort):
+        _tell("interrupted")
+        code = 130
+    except BrokenPipeError:  # the reader of a pipe has gone: 'slamdepth ... | head'
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
+    logging.shutdown()
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _tell(message: str) -> None:
+    """One line, however the message is broken."""
+    if is_verbose() and sys.exc_info()[0] is not None:
+        error_console().print_exception()
+    print("error:", " ".join(message.split()), file=sys.stderr)

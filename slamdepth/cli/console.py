@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all commands share: how loud they are, and where they write."""
+
+from __future__ import annotations
+
+import logging
+import os
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def _set_verbose(asked: bool) -> bool:
+    if asked:
+        os.environ["SLAMDEPTH_DEBUG"] = "1"
+        show_log(logging.DEBUG)
+    return asked
+
+
+def _set_quiet(asked: bool) -> bool:
+    if asked:
+        show_log(logging.ERROR)
+    return asked
+
+
+VerboseOption = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", callback=_set_verbose, help="Tell everything; tracebacks of errors."),
+]
+QuietOption = Annotated[
+    bool, typer.Option("--quiet", "-q", callback=_set_quiet, help="Print errors and results only.")
+]
+
+
+def is_verbose() -> bool:
+    """True where the user wants tracebacks: ``--verbose`` or ``SLAMDEPTH_DEBUG`` set."""
+    return bool(os.environ.get("SLAMDEPTH_DEBUG"))
+
+
+def console() -> Console:
+    """Standard output: results."""
+    from rich.console import Console
+
+    return Console(highlight=False, soft_wrap=False)
+
+
+def error_console() -> Console:
+    """Standard error: progress, warnings, errors."""
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
+
+
+def show_log(level: int = logging.WARNING, target: Console | None = None) -> None:
+    """Show slamdepth's messages of ``level`` and above on standard error; the first call sets the level."""
+    package = logging.getLogger("slamdepth")
+    known = [handler for handler in package.handlers if getattr(handler, "is_of_cli", False)]
+    if known:
+        if target is not None:
+            known[0].console = target  # type: ignore[attr-defined]
+        return
+    from rich.logging import RichHandler
+
+    handler = RichHandler(
+        level, target or error_console(), show_time=False, show_path=False, markup=False, highlighter=None
+    )
+    handler.is_of_cli = True  # type: ignore[attr-defined]
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    package.addHandler(handler)
+    package.setLevel(min(level, package.level or level))

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``slamdepth evaluate``: the score of a trajectory file against another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from slamdepth.cli.console import QuietOption, VerboseOption, console, show_log
+
+
+def evaluate_command(
+    ground_truth: Annotated[Path, typer.Argument(metavar="GROUNDTRUTH", help="TUM trajectory file.")],
+    estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help="TUM trajectory file.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="Also write the figures here, as JSON."),
+    ] = None,
+    max_difference: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="Poses farther apart in time are not compared. Default: 0.01"),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(metavar="HZ", help="Poses per second, for RPE. Default: as the estimate's times say"),
+    ] = None,
+    verbose: VerboseOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Compare two TUM trajectory files: ATE and RPE, as evo's own commands give them.
+
+    Example: slamdepth evaluate desk/groundtruth.txt runs/desk/trajectory.txt --output score.json
+    """
+    show_log()
+    from slamdepth.errors import ConfigError
+    from slamdepth.evaluation import MAX_DIFFERENCE_S, score_trajectory
+    from slamdepth.io import read_tum_trajectory, write_json
+    from slamdepth.report import trajectory_table
+
+    for name, value in (("--max-difference", max_difference), ("--fps", fps)):
+        if value is not None and not value > 0:
+            raise ConfigError(f"{name} must be positive, got {value:g}")
+    truth, truth_notes = read_tum_trajectory(ground_truth)
+    estimated, estimate_notes = read_tum_trajectory(estimate)
+    score = score_trajectory(
+        truth,
+        estimated,
+        max_difference_s=MAX_DIFFERENCE_S if max_difference is None else max_difference,
+        fps=fps,
+    )
+    figures = score.to_dict()
+    notes = [*truth_notes, *estimate_notes]
+    if output is not None:
+        write_json(output, {**figures, "notes": notes})
+    out = console()
+    out.print(trajectory_table(figures, f"{estimate.name} against {ground_truth.name}"))
+    if not quiet:
+        for note in notes:
+            out.print(f"note: {note}", style="yellow", markup=False)
+        if output is not None:
+            out.print(f"figures: {output}", markup=False)

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``slamdepth run``: the main job."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from slamdepth.config import Config
+    from slamdepth.pipeline import RunProgress, RunResult
+
+_PLACES = {
+    "results": "",
+    "trajectory": "trajectory.txt",
+    "mesh file": "mesh.ply",
+    "report": "report.html",
+}
+
+
+def run_command(
+    sequence: Annotated[
+        Path, typer.Argument(metavar="SEQ", help="Folder of a sequence: TUM layout or 7-Scenes.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Run folder. Default: runs/<sequence>-<time>"),
+    ] = None,
+    depth: Annotated[
+        str | None,
+        typer.Option(metavar="dinov2|sensor", help="Where depth comes from. Default: dinov2"),
+    ] = None,
+    odometry: Annotated[
+        str | None,
+        typer.Option(metavar="orb|kiss-icp", help="What estimates the motion. Default: orb"),
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="camera.yaml with the intrinsics in pixels.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="YAML file with settings; options here win.")
+    ] = None,
+    max_frames: Annotated[int | None, typer.Option(min=1, metavar="N", help="Stop after N frames.")] = None,
+    stride: Annotated[int, typer.Option(min=1, metavar="N", help="Take every Nth frame.")] = 1,
+    no_mesh: Annotated[bool, typer.Option("--no-mesh", help="Make no mesh.")] = False,
+    voxel_size: Annotated[
+        float | None, typer.Option(metavar="M", help="Edge of the mesh's voxels in metres. Default: 0.02")
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(metavar="cpu|cuda", help="Where networks run. Default: cpu")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(metavar="N", help="Seed of everything random. Default: 0")
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier run in the output folder.")
+    ] = False,
+    verbose: VerboseOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Track a video sequence, mesh it, score it, write a report.
+
+    Example: slamdepth run rgbd_dataset_freiburg1_desk --depth dinov2 --output runs/desk
+
+    Ctrl-C finishes the run with the frames it has; a second Ctrl-C breaks it off.
+    """
+    settings = _settings(config, depth, odometry, voxel_size, device, seed)
+    from slamdepth.pipeline import RunOptions, run
+
+    options = RunOptions(sequence, output, camera, max_frames, stride, not no_mesh, overwrite)
+    with _stop_on_signals() as stop, _ProgressBar(quiet) as bar:
+        result = run(options, settings, progress=bar.show, stop=stop)
+    _print_result(result, quiet)
+
+
+def _settings(
+    path: Path | None,
+    depth: str | None,
+    odometry: str | None,
+    voxel_size: float | None,
+    device: str | None,
+    seed: int | None,
+) -> Config:
+    """Command line over YAML file over defaults."""
+    from slamdepth.config import Config
+
+    overrides: dict[str, Any] = {"odometry": odometry, "device": device, "seed": seed}
+    overrides = {name: value for name, value in overrides.items() if value is not None}
+    if depth is not None:
+        overrides["depth"] = {"name": depth}
+    if voxel_size is not None:
+        overrides["map"] = {"voxel_size_m": voxel_size}
+    if path is None:
+        return Config.from_dict(overrides, origin="command line")
+    return Config.from_yaml(path, overrides)
+
+
+@contextmanager
+def _stop_on_signals() -> Iterator[threading.Event]:
+    """An event that Ctrl-C and SIGTERM set; the second one raises KeyboardInterrupt."""
+    stop = threading.Event()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _ProgressBar:
+    """Frames, rate, state, keyframes, loops; on a pipe a line now and then instead."""
+
+    def __init__(self, quiet: bool) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self._console = error_console()
+        self._bar = Progress(
+            TextColumn("{task.description:<10}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[state]}"),
+            TimeRemainingColumn(compact=True),
+            console=self._console,
+            disable=quiet or not self._console.is_terminal,
+            transient=True,
+        )
+        self._lines = not quiet and not self._console.is_terminal
+        self._task = self._bar.add_task("opening", total=None, state="")
+        self._stage = ""
+        self._next_line = 0
+
+    def __enter__(self) -> _ProgressBar:
+        show_log(target=self._console)
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, progress: RunProgress) -> None:
+        """Show one state of the run."""
+        state = ""
+        if progress.status is not None:
+            state = (
+                f"{progress.fps:.1f} fps · {progress.status.value} · "
+                f"{progress.keyframes} keyframes · {progress.loop_closures} loops"
+            )
+        stage = progress.stage.value
+        is_new = stage != self._stage
+        self._stage = stage
+        if is_new:
+            self._bar.reset(self._task, total=progress.total or None, description=stage, state=state)
+        self._bar.update(self._task, completed=progress.done, total=progress.total or None, state=state)
+        if self._lines and (is_new or (state and progress.done >= self._next_line)):
+            self._next_line = progress.done + max(1, progress.total // 10)
+            count = f" {progress.done}/{progress.total}" if progress.total else ""
+            self._console.print(f"{stage}{count} {state}".rstrip(), markup=False)
+
+
+def _print_result(result: RunResult, quiet: bool) -> None:
+    from slamdepth.report import run_table
+
+    places = {
+        name: str(result.folder / file)
+        for name, file in _PLACES.items()
+        if not file or (result.folder / file).exists()
+    }
+    out = console()
+    out.print(run_table(result.summary, places))
+    if not quiet:
+        for note in result.summary["notes"]:
+            out.print(f"note: {note}", style="yellow", markup=False)

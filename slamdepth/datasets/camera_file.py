@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``camera.yaml``: the intrinsics of a sequence, in pixels.
+
+::
+
+    width: 640
+    height: 480
+    fx: 535.4
+    fy: 539.2
+    cx: 320.1
+    cy: 247.6
+    distortion: [0.0, 0.0, 0.0, 0.0, 0.0]   # k1 k2 p1 p2 k3; may be absent
+    depth_factor: 5000.0                    # raw units per metre; may be absent
+    fps: 30.0                               # may be absent
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from slamdepth.errors import CameraError
+from slamdepth.io import write_text
+from slamdepth.types import Camera
+
+CAMERA_FILE = "camera.yaml"
+REQUIRED_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
+OPTIONAL_KEYS = ("distortion", "depth_factor", "fps")
+
+
+def read_camera(path: str | Path) -> Camera:
+    """Read a ``camera.yaml``.
+
+    Raises:
+        CameraError: the file is missing or no YAML, or a key is missing, unknown, given
+            twice or of a wrong type; names the file, the key and the allowed ones.
+    """
+    path = Path(path)
+    values = _load(path)
+    allowed = REQUIRED_KEYS + OPTIONAL_KEYS
+    unknown = [key for key in values if key not in allowed]
+    if unknown:
+        raise CameraError(f"{path}: unknown key {unknown[0]!r}; allowed are {', '.join(allowed)}")
+    missing = [key for key in REQUIRED_KEYS if key not in values]
+    if missing:
+        raise CameraError(
+            f"{path}: {_plural(missing)} {', '.join(missing)} missing; "
+            f"needed are {', '.join(REQUIRED_KEYS)}, allowed also {', '.join(OPTIONAL_KEYS)}"
+        )
+    settings: dict[str, Any] = {}
+    for key, value in values.items():
+        if key in ("width", "height"):
+            settings[key] = _whole(path, key, value)
+        elif key == "distortion":
+            settings[key] = _distortion(path, value)
+        else:
+            settings[key] = _number(path, key, value)
+    try:
+        return Camera(**settings)
+    except CameraError as error:
+        raise CameraError(f"{path}: {str(error).removeprefix('camera: ')}") from error
+
+
+def write_camera(path: str | Path, camera: Camera) -> None:
+    """Write ``camera`` so that :func:`read_camera` gives back an equal one.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+    """
+    values: dict[str, Any] = {key: int(getattr(camera, key)) for key in ("width", "height")}
+    values |= {key: float(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy")}
+    values["distortion"] = [float(value) for value in camera.distortion]
+    values |= {key: float(getattr(camera, key)) for key in ("depth_factor", "fps")}
+    write_text(path, yaml.safe_dump(values, sort_keys=False, default_flow_style=None))
+
+
+def _load(path: Path) -> dict[Any, Any]:
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+        # safe_load would let the last of two equal keys win without a word.
+        tree = yaml.compose(text, Loader=yaml.SafeLoader)
+        values = yaml.safe_load(text)
+    except OSError as error:
+        raise CameraError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: bad UTF-8, a 13th month
+        reason = (str(error).splitlines() or ["damaged"])[0]
+        raise CameraError(f"{path}: not valid YAML: {reason}") from error
+    if not isinstance(values, dict) or not isinstance(tree, yaml.MappingNode):
+        raise CameraError(f"{path}: expected lines 'key: value' with the keys {', '.join(REQUIRED_KEYS)}")
+    names = [key.value for key, _ in tree.value if isinstance(key, yaml.ScalarNode)]
+    for name in names:
+        if names.count(name) > 1:
+            raise CameraError(f"{path}: key {name!r} is given twice")
+    return values
+
+
+def _plural(names: list[str]) -> str:
+    return "key" if len(names) == 1 else "keys"
+
+
+def _number(path: Path, key: str, value: Any) -> float:
+    # bool is an int to Python, and '1e3' without a dot a text to YAML 1.1.
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise CameraError(f"{path}: key {key!r} must be a number such as 500.0, found {value!r}")
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise CameraError(f"{path}: key {key!r} is out of range") from error
+
+
+def _whole(path: Path, key: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise CameraError(f"{path}: key {key!r} must be a whole number of pixels, found {value!r}")
+    return value
+
+
+def _distortion(path: Path, value: Any) -> tuple[float, ...]:
+    if not isinstance(value, list) or len(value) != 5:
+        raise CameraError(
+            f"{path}: key 'distortion' must be five numbers [k1, k2, p1, p2, k3], found {value!r}"
+        )
+    return tuple(_number(path, "distortion", item) for item in value)

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The layout of the TUM RGB-D benchmark (Sturm et al., IROS 2012).
+
+``rgb.txt`` and, optionally, ``depth.txt`` list ``timestamp filename``; ``groundtruth.txt``
+lists camera-to-world poses. Depth images are 16-bit PNGs registered to the colour image.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.datasets.association import associate
+from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera
+from slamdepth.datasets.registry import register_reader
+from slamdepth.datasets.sequence import (
+    MAX_TIME_DIFFERENCE_S,
+    ImageSequence,
+    check_overlap,
+    check_size,
+    first_image,
+    is_file,
+)
+from slamdepth.errors import CameraError, DatasetError
+from slamdepth.io import parse_float, read_lines, read_tum_trajectory
+from slamdepth.types import Camera
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+# As ORB-SLAM2's settings files give them, but for the depth factor of freiburg2 (see the note).
+_KNOWN_CAMERAS = {
+    "1": Camera(
+        640, 480, 517.306408, 516.469215, 318.643040, 255.313989,
+        (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+    ),
+    "2": Camera(
+        640, 480, 520.908620, 521.007327, 325.141442, 249.701764,
+        (0.231222, -0.784899, -0.003257, -0.000105, 0.917205),
+    ),
+    "3": Camera(640, 480, 535.4, 539.2, 320.1, 247.6),
+}  # fmt: skip
+_KNOWN_NAME = re.compile(r"(?:^|[^a-z0-9])(?:freiburg|fr)([123])(?![a-z0-9])", re.IGNORECASE)
+
+
+@register_reader
+class TumReader:
+    """Opens TUM folders."""
+
+    name = "tum"
+    needs = "rgb.txt and the images it lists; optional depth.txt, groundtruth.txt, camera.yaml"
+
+    def matches(self, path: Path) -> bool:
+        return any((path / name).exists() for name in ("rgb.txt", "depth.txt", "groundtruth.txt", "rgb"))
+
+    def open(self, path: Path, camera: Camera | None) -> ImageSequence:
+        notes: list[str] = []
+        timestamps_s, image_paths = read_image_list(path / "rgb.txt")
+        _check_images(path / "rgb.txt", image_paths, notes)
+        sample_path, sample_shape = first_image(image_paths)
+        if camera is None:
+            camera = _find_camera(path, sample_shape, notes)
+        check_size(sample_path, sample_shape, camera)
+
+        depth_paths = _match_depth(path / "depth.txt", timestamps_s, notes)
+        ground_truth = None
+        if (path / "groundtruth.txt").exists():
+            ground_truth, repairs = read_tum_trajectory(path / "groundtruth.txt")
+            notes += repairs
+            check_overlap(timestamps_s, ground_truth, path / "groundtruth.txt")
+        return ImageSequence(
+            path.resolve().name, path, camera, timestamps_s, image_paths, depth_paths, ground_truth, notes
+        )
+
+
+def read_image_list(path: Path) -> tuple[NDArray[np.float64], tuple[Path, ...]]:
+    """Read ``timestamp filename`` lines; file names are relative to the list.
+
+    Returns:
+        Times ``(N,)`` in seconds, strictly increasing, and ``N`` paths.
+
+    Raises:
+        DatasetError: the file is missing, a line is malformed, or its time does not
+            increase; names file and line. An empty list is no error here.
+    """
+    if not path.exists():
+        raise DatasetError(f"{path}: missing; it lists the images, 'timestamp filename' a line")
+    times: list[float] = []
+    images: list[Path] = []
+    for number, line in read_lines(path):
+        fields = re.split(r"[\s,]+", line, maxsplit=1)
+        try:
+            time_s = parse_float(fields[0])
+        except ValueError:
+            time_s = np.nan
+        if len(fields) != 2 or not fields[1] or not np.isfinite(time_s):
+            raise DatasetError(f"{path}:{number}: expected 'timestamp filename', found {line[:80]!r}")
+        if times and time_s <= times[-1]:
+            raise DatasetError(
+                f"{path}:{number}: time {fields[0]} does not come after {times[-1]:.6f}: times must increase"
+            )
+        times.append(time_s)
+        images.append(path.parent / fields[1])
+    return np.array(times, dtype=np.float64), tuple(images)
+
+
+def known_camera(name: str) -> Camera | None:
+    """The camera of a TUM sequence by its folder's name, such as ``rgbd_dataset_freiburg1_desk``."""
+    found = _KNOWN_NAME.search(name)
+    return _KNOWN_CAMERAS[found[1]] if found else None
+
+
+def _check_images(list_path: Path, image_paths: tuple[Path, ...], notes: list[str]) -> None:
+    if not image_paths:
+        raise DatasetError(f"{list_path}: lists no images; expected 'timestamp filename' a line")
+    missing = [path for path in image_paths if not is_file(path)]
+    if len(missing) == len(image_paths):
+        raise DatasetError(
+            f"{list_path}: none of its {len(missing)} images exists; the first is {missing[0]}"
+        )
+    if missing:
+        notes.append(f"{list_path.name}: {len(missing)} of {len(image_paths)} images do not exist")
+
+
+def _match_depth(
+    list_path: Path, timestamps_s: NDArray[np.float64], notes: list[str]
+) -> tuple[Path | None, ...]:
+    matched: list[Path | None] = [None] * len(timestamps_s)
+    if not list_path.exists():
+        return tuple(matched)
+    depth_times_s, depth_paths = read_image_list(list_path)
+    _check_images(list_path, depth_paths, notes)
+    for i, j in associate(timestamps_s, depth_times_s, MAX_TIME_DIFFERENCE_S):
+        if is_file(depth_paths[j]):
+            matched[i] = depth_paths[j]
+    without = matched.count(None)
+    if without:
+        notes.append(
+            f"{list_path.name}: {without} of {len(matched)} colour images have no depth image "
+            f"within {MAX_TIME_DIFFERENCE_S} s"
+        )
+    return tuple(matched)
+
+
+def _find_camera(path: Path, image_shape: tuple[int, ...], notes: list[str]) -> Camera:
+    camera_path = path / CAMERA_FILE
+    if camera_path.exists():
+        return read_camera(camera_path)
+    for name in (path.name, path.resolve().name):  # the second for '.' and links
+        camera = known_camera(name)
+        if camera is not None:
+            note = f"intrinsics known by the folder's name {name!r}"
+            if camera is _KNOWN_CAMERAS["2"]:
+                note += "; depth factor 5000 as the benchmark says, ORB-SLAM2 uses 5208 for freiburg2"
+            notes.append(note)
+            return camera
+    height, width = image_shape[:2]
+    raise CameraError(
+        f"{path}: intrinsics are unknown: write {camera_path} or pass --camera FILE with the lines "
+        f"'width: {width}', 'height: {height}', 'fx: ...', 'fy: ...', 'cx: ...', 'cy: ...' (pixels) and, "
+        "where they apply, 'distortion: [k1, k2, p1, p2, k3]', 'depth_factor: 5000' (raw depth units per "
+        "metre), 'fps: 30'"
+    )

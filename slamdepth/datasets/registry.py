@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which sequence layouts are known, and which of them a folder has.
+
+A layout is one file in ``slamdepth/datasets/readers/`` with a class under
+``@register_reader``; the files are imported when the first sequence is opened.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import pkgutil
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from slamdepth.datasets.base import Dataset
+from slamdepth.datasets.camera_file import read_camera
+from slamdepth.errors import DatasetError
+from slamdepth.types import Camera
+
+_log = logging.getLogger(__name__)
+
+
+class Reader(Protocol):
+    """Opens the folders of one layout.
+
+    Attributes:
+        name: short name of the layout.
+        needs: the files it needs, as a user should read them.
+    """
+
+    name: str
+    needs: str
+
+    def matches(self, path: Path) -> bool:
+        """True where the folder ``path`` is meant to have this layout, whole or not."""
+        ...
+
+    def open(self, path: Path, camera: Camera | None) -> Dataset:
+        """Open the folder; ``camera`` is what the user gave, or None.
+
+        Raises:
+            DatasetError: a file is missing or malformed.
+            CameraError: the intrinsics are unknown.
+        """
+        ...
+
+
+_ReaderType = TypeVar("_ReaderType", bound=Reader)
+_readers: dict[str, Reader] = {}
+
+
+def register_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
+    """Class decorator that makes a :class:`Reader` known to :func:`open_dataset`."""
+    reader = reader_type()
+    if reader.name in _readers:
+        raise ValueError(f"two dataset readers are named {reader.name!r}")
+    _readers[reader.name] = reader
+    return reader_type
+
+
+def known_readers() -> tuple[Reader, ...]:
+    """Every reader, in order of its name."""
+    from slamdepth.datasets import readers
+
+    for module in pkgutil.iter_modules(readers.__path__):
+        importlib.import_module(f"{readers.__name__}.{module.name}")
+    return tuple(_readers[name] for name in sorted(_readers))
+
+
+def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dataset:
+    """Open the sequence in a folder, whatever its layout.
+
+    Args:
+        path: the folder.
+        camera_file: a ``camera.yaml`` that overrules what the folder says or is known for.
+
+    Raises:
+        DatasetError: the folder is missing, of no known layout, or its files are
+            missing or malformed; names file and line.
+        CameraError: the intrinsics are malformed, unknown, or of another image size.
+    """
+    path = Path(path).expanduser()
+    try:
+        if not path.exists():
+            raise DatasetError(f"{path}: no such folder")
+        if not path.is_dir():
+            raise DatasetError(f"{path}: is a file; a sequence is a folder")
+        camera = None if camera_file is None else read_camera(Path(camera_file).expanduser())
+        readers = known_readers()
+        for reader in readers:
+            if reader.matches(path):
+                _log.info("%s: reading as layout '%s'", path, reader.name)
+                dataset = reader.open(path, camera)
+                for note in dataset.notes:
+                    _log.info("%s: %s", dataset.name, note)
+                return dataset
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+    layouts = "; ".join(f"{reader.name} ({reader.needs})" for reader in readers)
+    raise DatasetError(f"{path}: no known sequence layout; known are: {layouts}")

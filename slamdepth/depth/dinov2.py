@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""DINOv2 ViT (Oquab et al. 2023) without registers, in plain PyTorch, for inference.
+
+Parameter names are those of the official files, so both load without renaming.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from slamdepth.depth.layout import check_layout, dinov2_layout
+from slamdepth.errors import WeightsError
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class _Attention(nn.Module):
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.proj = nn.Linear(dim, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        batch, tokens, dim = x.shape
+        qkv = self.qkv(x).reshape(batch, tokens, 3, self.heads, dim // self.heads)
+        query, key, value = qkv.permute(2, 0, 3, 1, 4)
+        out = F.scaled_dot_product_attention(query, key, value)
+        return self.proj(out.transpose(1, 2).reshape(batch, tokens, dim))
+
+
+class _Mlp(nn.Module):
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(dim, 4 * dim)
+        self.fc2 = nn.Linear(4 * dim, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc2(F.gelu(self.fc1(x)))
+
+
+class _LayerScale(nn.Module):
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.ones(dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x * self.gamma
+
+
+class _Block(nn.Module):
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim, eps=1e-6)
+        self.attn = _Attention(dim, heads)
+        self.ls1 = _LayerScale(dim)
+        self.norm2 = nn.LayerNorm(dim, eps=1e-6)
+        self.mlp = _Mlp(dim)
+        self.ls2 = _LayerScale(dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self.ls1(self.attn(self.norm1(x)))
+        return x + self.ls2(self.mlp(self.norm2(x)))
+
+
+class _PatchEmbed(nn.Module):
+    def __init__(self, dim: int, patch: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(3, dim, patch, stride=patch)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.proj(x).flatten(2).transpose(1, 2)
+
+
+class DinoV2(nn.Module):
+    """The encoder; ``forward`` returns the tokens after chosen blocks.
+
+    Args:
+        dim, depth, heads: width, number of blocks and of attention heads (ViT-S: 384, 12, 6).
+        patch: pixels per token side.
+        grid: side of the square position embedding.
+    """
+
+    def __init__(
+        self, dim: int = 384, depth: int = 12, heads: int = 6, patch: int = 14, grid: int = 37
+    ) -> None:
+        super().__init__()
+        self.dim, self.patch, self.grid = dim, patch, grid
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, dim))
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + grid * grid, dim))
+        self.patch_embed = _PatchEmbed(dim, patch)
+        self.blocks = nn.ModuleList(_Block(dim, heads) for _ in range(depth))
+        self.norm = nn.LayerNorm(dim, eps=1e-6)
+        self._resized: dict[tuple[int, int], Tensor] = {}
+
+    def position_embedding(self, rows: int, columns: int) -> Tensor:
+        """Position embedding ``(1, 1 + rows * columns, dim)`` for another grid of tokens.
+
+        Bicubic with DINOv2's offset of 0.1 in the scale factor, as its own code does.
+        """
+        if (rows, columns) == (self.grid, self.grid):
+            return self.pos_embed
+        square = self.pos_embed[:, 1:].reshape(1, self.grid, self.grid, self.dim).permute(0, 3, 1, 2)
+        resized = F.interpolate(
+            square, scale_factor=((rows + 0.1) / self.grid, (columns + 0.1) / self.grid), mode="bicubic"
+        )
+        if resized.shape[-2:] != (rows, columns):
+            raise ValueError(f"position embedding came out {tuple(resized.shape[-2:])}, not {rows, columns}")
+        return torch.cat([self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2)], dim=1)
+
+    def forward(self, image: Tensor, taps: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
+        """Tokens after the blocks ``taps`` (ascending, 0-based), through the final norm.
+
+        Args:
+            image: ``(B, 3, H, W)`` normalised with the ImageNet mean and deviation; H
+                and W multiples of the patch size.
+
+        Returns:
+            For each tap the patch tokens ``(B, dim, H/patch, W/patch)`` and the class
+            token ``(B, dim)``.
+
+        Raises:
+            ValueError: the image does not fit the patch size, or a tap does not exist.
+        """
+        if image.ndim != 4 or image.shape[1] != 3 or image.shape[2] % self.patch or image.shape[3] % self.patch:
+            raise ValueError(
+                f"the image must be (B, 3, H, W) with H and W multiples of {self.patch}, got {tuple(image.shape)}"
+            )
+        if not taps or min(taps) < 0 or max(taps) >= len(self.blocks):
+            raise ValueError(f"taps {list(taps)} are not blocks 0 to {len(self.blocks) - 1}")
+        rows, columns = image.shape[2] // self.patch, image.shape[3] // self.patch
+        x = torch.cat([self.cls_token.expand(len(image), -1, -1), self.patch_embed(image)], dim=1)
+        x = x + self._cached_position_embedding(rows, columns)
+        out = []
+        for index, block in enumerate(self.blocks[: max(taps) + 1]):
+            x = block(x)
+            if index in taps:
+                tokens = self.norm(x)
+                grid = tokens[:, 1:].transpose(1, 2).reshape(len(image), self.dim, rows, columns)
+                out.append((grid, tokens[:, 0]))
+        return out
+
+    def _cached_position_embedding(self, rows: int, columns: int) -> Tensor:
+        if torch.is_grad_enabled():
+            return self.position_embedding(rows, columns)
+        cached = self._resized.get((rows, columns))
+        if cached is None or cached.device != self.pos_embed.device:
+            cached = self._resized[(rows, columns)] = self.position_embedding(rows, columns)
+        return cached
+
+
+def load_dinov2(path: Path, device: str = "cpu") -> DinoV2:
+    """The ViT-S/14 of a safetensors or official ``.pth`` file, frozen, in eval mode.
+
+    Raises:
+        WeightsError: the file cannot be read, or a tensor is missing, extra or
+            misshapen; names it.
+    """
+    tensors = read_tensors(path)
+    check_layout(
+        {name: tuple(value.shape) for name, value in tensors.items()},
+        dinov2_layout(),
+        str(path),
+        ignored=("mask_token",),
+    )
+    tensors.pop("mask_token", None)
+    model = DinoV2()
+    model.load_state_dict({name: value.float() for name, value in tensors.items()})
+    return model.eval().requires_grad_(False).to(device)
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """All tensors of a safetensors or a (weights-only) PyTorch file.
+
+    Raises:
+        WeightsError: the file cannot be read or holds something else.
+    """
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(str(path))
+        loaded = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # pickle, zip and safetensors each raise their own types
+        first_line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise WeightsError(f"{path}: not a readable weights file: {first_line}") from error
+    if not isinstance(loaded, Mapping) or not all(isinstance(value, Tensor) for value in loaded.values()):
+        raise WeightsError(f"{path}: expected a flat table of tensors")
+    return dict(loaded)

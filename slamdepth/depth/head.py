@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The depth head: DINOv2 tokens and the image in, log depth and its uncertainty out.
+
+Tokens of several blocks and their class tokens are mixed at 1/14 of the resolution,
+brought to 1/7 together with a strided view of the image, and upsampled to the full input
+as convex combinations of the 3 x 3 coarse neighbours (Teed and Deng, RAFT, ECCV 2020):
+the weights come from the image, so edges stay where the image has them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from slamdepth.depth.layout import check_layout
+from slamdepth.errors import WeightsError
+
+_FACTOR = 7
+FORMAT = "slamdepth-depth-head-1"
+
+
+@dataclass(frozen=True)
+class HeadShape:
+    """What a head file needs to be built again.
+
+    Attributes:
+        taps: backbone blocks it reads, ascending.
+        token_dim: width of the backbone.
+        dim, blocks, guide_dim: channels and residual convolutions, see ``HeadConfig``.
+        members: heads whose predictions are averaged.
+    """
+
+    taps: tuple[int, ...] = (5, 8, 11)
+    token_dim: int = 384
+    dim: int = 128
+    blocks: int = 1
+    guide_dim: int = 64
+    members: int = 1
+
+
+class _Residual(nn.Module):
+    """Depthwise 5 x 5, then two pointwise convolutions, as in ConvNeXt (Liu et al. 2022)."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.spread = nn.Conv2d(dim, dim, 5, padding=2, groups=dim)
+        self.norm = nn.GroupNorm(1, dim)
+        self.conv1 = nn.Conv2d(dim, 2 * dim, 1)
+        self.conv2 = nn.Conv2d(2 * dim, dim, 1)
+        nn.init.zeros_(self.conv2.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.conv2(F.gelu(self.conv1(self.norm(self.spread(x)))))
+
+
+class DepthHead(nn.Module):
+    """One head. ``dropout`` works in training only."""
+
+    def __init__(self, shape: HeadShape, dropout: float = 0.0) -> None:
+        super().__init__()
+        width = len(shape.taps) * shape.token_dim
+        self.drop = nn.Dropout2d(dropout)
+        self.tokens = nn.Conv2d(width, shape.dim, 1)
+        self.class_tokens = nn.Linear(width, shape.dim)
+        self.blocks = nn.ModuleList(_Residual(shape.dim) for _ in range(shape.blocks))
+        self.narrow = nn.Conv2d(shape.dim, shape.guide_dim, 1)
+        self.guide = nn.Conv2d(3 * _FACTOR * _FACTOR, shape.guide_dim, 1)
+        self.mix = _Residual(shape.guide_dim)
+        self.out = nn.Conv2d(shape.guide_dim, 2, 1)
+        self.weights = nn.Conv2d(shape.guide_dim, 9 * _FACTOR * _FACTOR, 1)
+        nn.init.normal_(self.out.weight, std=1e-3)
+        with torch.no_grad():
+            self.out.bias.copy_(torch.tensor([math.log(1.8), math.log(0.3)]))
+
+    def coarse(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Log depth and log spread ``(B, 2, H/7, W/7)``, and what the upsampling needs."""
+        batch, taps, dim, rows, columns = tokens.shape
+        x = self.tokens(self.drop(tokens.reshape(batch, taps * dim, rows, columns)))
+        cls = self.drop(class_tokens.reshape(batch, taps * dim, 1, 1))[..., 0, 0]
+        x = F.gelu(x + self.class_tokens(cls)[..., None, None])
+        for block in self.blocks:
+            x = block(x)
+        x = F.interpolate(self.narrow(x), scale_factor=2, mode="bilinear", align_corners=False)
+        x = self.mix(F.gelu(x + self.guide(F.pixel_unshuffle(image, _FACTOR))))
+        return self.out(x), x
+
+    def forward(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> Tensor:
+        """Predict from ``tokens (B, taps, dim, H/14, W/14)``, ``class_tokens (B, taps, dim)``
+        and the ImageNet-normalised ``image (B, 3, H, W)``.
+
+        Returns:
+            ``(B, 2, H, W)``: natural logarithm of the canonical depth, and of its Laplace spread.
+        """
+        coarse, features = self.coarse(tokens, class_tokens, image)
+        return convex_upsample(coarse, self.weights(features))
+
+
+def convex_upsample(coarse: Tensor, logits: Tensor) -> Tensor:
+    """``coarse (B, C, h, w)`` at 7 times the size; ``logits (B, 9 * 49, h, w)`` choose among
+    each pixel's 3 x 3 coarse neighbours."""
+    batch, channels, rows, columns = coarse.shape
+    weights = logits.reshape(batch, 1, 9, _FACTOR * _FACTOR, rows * columns).softmax(dim=2)
+    padded = F.pad(coarse, (1, 1, 1, 1), mode="replicate")
+    neighbours = F.unfold(padded, 3).reshape(batch, channels, 9, 1, rows * columns)
+    fine = (weights * neighbours).sum(dim=2)
+    return F.pixel_shuffle(
+        fine.reshape(batch, channels * _FACTOR * _FACTOR, rows, columns), _FACTOR
+    )
+
+
+class HeadEnsemble(nn.Module):
+    """Heads trained from different seeds; what they disagree on adds to the uncertainty.
+
+    Args:
+        sigma_scale: factor that makes sigma cover 68 % of the errors on held-out places.
+    """
+
+    def __init__(self, shape: HeadShape, sigma_scale: float = 1.0) -> None:
+        super().__init__()
+        self.shape = shape
+        self.sigma_scale = sigma_scale
+        self.members = nn.ModuleList(DepthHead(shape) for _ in range(shape.members))
+
+    def forward(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean log depth and its calibrated standard deviation, each ``(B, H, W)``."""
+        outs = torch.stack([member(tokens, class_tokens, image) for member in self.members])
+        mean = outs[:, :, 0].mean(dim=0)
+        # A Laplace distribution of spread b has the variance 2 b^2.
+        variance = (2.0 * outs[:, :, 1].mul(2.0).exp()).mean(dim=0)
+        variance = variance + outs[:, :, 0].var(dim=0, unbiased=False)
+        return mean, self.sigma_scale * variance.sqrt()
+
+
+def save_head(path: Path, model: HeadEnsemble, about: dict[str, str]) -> None:
+    """Write ``model`` in half precision, atomically, with ``about`` in the header."""
+    from safetensors.torch import save
+
+    tensors = {name: value.detach().half().contiguous() for name, value in model.state_dict().items()}
+    meta = {
+        **about,
+        "format": FORMAT,
+        "shape": json.dumps(asdict(model.shape)),
+        "sigma_scale": repr(float(model.sigma_scale)),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(save(tensors, metadata=dict(sorted(meta.items()))))
+    partial.replace(path)
+
+
+def load_head(path: Path, device: str = "cpu") -> tuple[HeadEnsemble, dict[str, str]]:
+    """A head file, in eval mode, with its header.
+
+    Raises:
+        WeightsError: the file is missing, of another format, or a tensor is missing,
+            extra or misshapen; names it.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such depth head")
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            meta = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path}: not a readable safetensors file: {error}") from error
+    if meta.get("format") != FORMAT:
+        raise WeightsError(f"{path}: not a depth head of this package (format {meta.get('format')!r})")
+    try:
+        values = json.loads(meta["shape"])
+        shape = HeadShape(**{**values, "taps": tuple(values["taps"])})
+        model = HeadEnsemble(shape, float(meta["sigma_scale"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise WeightsError(f"{path}: the header does not describe a depth head: {error}") from error
+    check_layout(
+        {name: tuple(value.shape) for name, value in tensors.items()},
+        {name: tuple(value.shape) for name, value in model.state_dict().items()},
+        str(path),
+    )
+    model.load_state_dict({name: value.float() for name, value in tensors.items()})
+    return model.eval().requires_grad_(False).to(device), meta

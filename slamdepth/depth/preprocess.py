@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a frame of any size to the network's input, and the focal length that goes with it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.types import Camera
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import NDArray
+
+PATCH = 14
+INPUT_AREA = 238 * 322
+CANONICAL_FOCAL_PX = 280.0
+"""Focal length, in pixels of the network's input, at which log depth is predicted.
+
+Depth seen through a lens twice as long looks half as far, so the network predicts
+``z * CANONICAL_FOCAL_PX / f`` and :func:`focal_factor` undoes it.
+"""
+
+
+def input_size(height: int, width: int, area: int = INPUT_AREA) -> tuple[int, int]:
+    """Rows and columns of the network input: multiples of 14 of about ``area`` pixels
+    that keep the aspect of a ``height`` x ``width`` image."""
+    scale = math.sqrt(area / (height * width))
+    rows = max(1, round(height * scale / PATCH)) * PATCH
+    columns = max(1, round(width * scale / PATCH)) * PATCH
+    return rows, columns
+
+
+def focal_factor(camera: Camera, rows: int, columns: int) -> float:
+    """Metres per canonical metre for the image of ``camera`` resized to ``rows`` x ``columns``."""
+    scaled = camera.scaled(columns, rows)
+    return math.sqrt(scaled.fx * scaled.fy) / CANONICAL_FOCAL_PX
+
+
+def resize_rgb(image_rgb: NDArray[np.uint8], rows: int, columns: int) -> NDArray[np.uint8]:
+    """``image_rgb (H, W, 3)`` at the network's size; area averaging where it shrinks."""
+    import cv2
+
+    if image_rgb.shape[:2] == (rows, columns):
+        return image_rgb
+    shrinks = rows < image_rgb.shape[0]
+    return cv2.resize(image_rgb, (columns, rows), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+
+
+def normalised(images_rgb: NDArray[np.uint8], device: str) -> torch.Tensor:
+    """``(B, H, W, 3)`` uint8 as the ``(B, 3, H, W)`` tensor DINOv2 takes."""
+    import torch
+
+    from slamdepth.depth.dinov2 import IMAGENET_MEAN, IMAGENET_STD
+
+    x = torch.from_numpy(np.ascontiguousarray(images_rgb)).to(device).permute(0, 3, 1, 2).float() / 255.0
+    mean = torch.tensor(IMAGENET_MEAN, device=device).view(1, 3, 1, 1)
+    std = torch.tensor(IMAGENET_STD, device=device).view(1, 3, 1, 1)
+    return ((x - mean) / std).contiguous()

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training views: a real RGB + depth pair seen by a virtual camera turned and zoomed in place.
+
+A camera that only turns sees the same scene through a homography, so roll, pan, tilt and
+zoom of a pair are exact, depth included. What is wanted is variety the recordings lack:
+held-rolled cameras, other focal lengths, other distances, other light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.depth.training.config import AugmentConfig
+from slamdepth.geometry import so3_exp
+from slamdepth.types import Frame
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class View:
+    """One training sample before the backbone.
+
+    Attributes:
+        image_rgb: ``(rows, columns, 3)`` uint8.
+        depth_m: ``(rows, columns)`` float32, 0 where unknown.
+        focal_px: focal length in pixels of ``image_rgb``.
+    """
+
+    image_rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    focal_px: float
+
+
+def augmented_view(
+    frame: Frame, rows: int, columns: int, config: AugmentConfig, rng: np.random.Generator
+) -> View:
+    """A random view of ``frame`` (which has depth) at ``rows`` x ``columns`` pixels."""
+    flip = rng.random() < config.flip
+    rolled = rng.random() < config.rolled
+    roll = (
+        rng.uniform(-config.max_roll_deg, config.max_roll_deg)
+        if rolled
+        else rng.normal(0.0, config.upright_roll_deg)
+    )
+    tilt = rng.uniform(-config.max_tilt_deg, config.max_tilt_deg, 2)
+    # A rolled view without zoom would show more of the mirrored border than of the scene.
+    least = 1.0 + 0.25 * abs(np.sin(np.radians(roll)))
+    zoom = float(np.exp(rng.uniform(np.log(least), np.log(max(config.max_zoom, least)))))
+    image, depth, focal = turned_view(frame, rows, columns, roll, tilt[0], tilt[1], zoom, flip)
+    return View(photometric(image, config, rng), depth, focal)
+
+
+def plain_view(frame: Frame, rows: int, columns: int) -> View:
+    """``frame`` seen by its own camera with square pixels, centred, at ``rows`` x ``columns``."""
+    return View(*turned_view(frame, rows, columns, 0.0, 0.0, 0.0, 1.0, False))
+
+
+def turned_view(
+    frame: Frame,
+    rows: int,
+    columns: int,
+    roll_deg: float,
+    pan_deg: float,
+    tilt_deg: float,
+    zoom: float,
+    flip: bool,
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], float]:
+    """Image, depth and focal length (px) of ``frame`` after an exact camera rotation.
+
+    Pixels from outside the frame mirror its border and have depth 0.
+    """
+    import cv2
+
+    assert frame.depth_m is not None
+    camera = frame.camera
+    focal = zoom * camera.fx * max(rows / camera.height, columns / camera.width)
+    K_view = np.array([[focal, 0, (columns - 1) / 2], [0, focal, (rows - 1) / 2], [0, 0, 1.0]])
+    if flip:
+        K_view = np.diag([-1.0, 1.0, 1.0]) @ K_view
+        K_view[0, 2] += columns - 1
+    R_camera_view = so3_exp(np.radians([0.0, 0.0, roll_deg])) @ so3_exp(np.radians([tilt_deg, pan_deg, 0.0]))
+    u, v = np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64))
+    rays_view = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K_view).T
+    rays = rays_view @ R_camera_view.T
+    pixels = (rays / rays[..., 2:]) @ camera.K.T
+    map_x, map_y = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
+    image = cv2.remap(frame.image_rgb, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    raw = cv2.remap(
+        frame.depth_m, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+    )
+    # A point at z on its old ray lies at z / ray_z on the new optical axis's depth.
+    depth = raw / rays[..., 2].astype(np.float32)
+    return image, depth.astype(np.float32), float(focal)
+
+
+def photometric(
+    image_rgb: NDArray[np.uint8], config: AugmentConfig, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Random light, tint, saturation, blur, noise and compression of ``(H, W, 3)`` uint8."""
+    import cv2
+
+    x = image_rgb.astype(np.float32) / 255.0
+    s = config.colour
+    if s > 0:
+        x = x ** np.float32(np.exp(rng.normal(0, 0.5 * s)))
+        x *= np.exp(rng.normal(0, 0.25 * s, 3)).astype(np.float32) * np.float32(np.exp(rng.normal(0, 0.5 * s)))
+        grey = x.mean(axis=2, keepdims=True)
+        x = grey + (x - grey) * np.float32(np.exp(rng.normal(0, s)))
+        x = x.mean() + (x - x.mean()) * np.float32(np.exp(rng.normal(0, 0.4 * s)))
+    if rng.random() < config.blur:
+        if rng.random() < 0.5:
+            x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.6))
+        else:
+            x = cv2.filter2D(x, -1, _motion_kernel(int(rng.integers(3, 10)), rng.uniform(0, np.pi)))
+    if rng.random() < config.noise:
+        x = x + rng.normal(0, rng.uniform(0.005, 0.03), x.shape).astype(np.float32)
+    out = np.clip(x * 255.0 + 0.5, 0, 255).astype(np.uint8)
+    if rng.random() < config.jpeg:
+        quality = int(rng.integers(40, 96))
+        _, data = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        out = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    return out
+
+
+def _motion_kernel(length: int, angle_rad: float) -> NDArray[np.float32]:
+    import cv2
+
+    kernel = np.zeros((length, length), np.float32)
+    centre = (length - 1) / 2
+    step = centre * np.array([np.cos(angle_rad), np.sin(angle_rad)])
+    a, b = np.round(centre - step).astype(int), np.round(centre + step).astype(int)
+    cv2.line(kernel, tuple(map(int, a)), tuple(map(int, b)), 1.0)
+    return kernel / kernel.sum()

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of one training: frozen, validated, read from YAML."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from slamdepth.errors import ConfigError
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class AugmentConfig(_Section):
+    """What is done to a training image before the backbone sees it."""
+
+    flip: float = Field(0.5, ge=0, le=1, description="share of mirrored images")
+    upright_roll_deg: float = Field(6.0, ge=0, le=90, description="deviation of the roll of upright images")
+    rolled: float = Field(0.5, ge=0, le=1, description="share of images rolled by up to max_roll_deg")
+    max_roll_deg: float = Field(60.0, ge=0, le=180, description="largest in-plane roll")
+    max_tilt_deg: float = Field(8.0, ge=0, le=30, description="largest virtual pan and tilt")
+    max_zoom: float = Field(1.6, ge=1, le=4, description="largest focal length over the camera's own")
+    colour: float = Field(0.4, ge=0, le=1, description="strength of brightness, contrast, tint changes")
+    blur: float = Field(0.3, ge=0, le=1, description="share of blurred images")
+    noise: float = Field(0.3, ge=0, le=1, description="share of images with sensor noise")
+    jpeg: float = Field(0.5, ge=0, le=1, description="share of images compressed again")
+
+
+class PlaceConfig(_Section):
+    """One folder of training pairs: one place, one camera."""
+
+    name: str = Field(description="folder below the data folder")
+    samples: int = Field(200, ge=1, description="augmented samples drawn from it, spread over its frames")
+
+
+class DataConfig(_Section):
+    """Which pairs are seen, and how they are shown."""
+
+    folder: str = Field(description="folder of the places; relative to $SLAMDEPTH_DATA if not absolute")
+    places: tuple[PlaceConfig, ...] = Field(min_length=1)
+    held_out: tuple[str, ...] = Field((), description="places judged on after training, never trained on")
+    rows: int = Field(238, ge=28, multiple_of=14, description="height of the network input")
+    columns: int = Field(322, ge=28, multiple_of=14, description="width of the network input")
+    min_depth_m: float = Field(0.2, gt=0)
+    max_depth_m: float = Field(10.0, gt=0)
+    augment: AugmentConfig = AugmentConfig()
+
+
+class HeadConfig(_Section):
+    """Shape of the head."""
+
+    taps: tuple[int, ...] = Field((5, 8, 11), min_length=1, description="backbone blocks it reads")
+    dim: int = Field(128, ge=8, le=512, description="channels at token resolution")
+    blocks: int = Field(1, ge=0, le=8, description="residual convolutions at token resolution")
+    guide_dim: int = Field(64, ge=4, le=256, description="channels that carry image edges to the upsampling")
+    dropout: float = Field(0.2, ge=0, lt=1, description="share of token channels dropped in training")
+
+
+class LossConfig(_Section):
+    """Weights of the terms of the loss."""
+
+    nll: float = Field(1.0, ge=0, description="Laplace likelihood of log depth with its uncertainty")
+    scale_invariant: float = Field(1.0, ge=0, description="variance-reduced squared log error")
+    scale_invariant_lambda: float = Field(0.5, ge=0, le=1)
+    gradient: float = Field(0.5, ge=0, description="multi-scale gradients of the log error")
+
+
+class TrainConfig(_Section):
+    """One training run."""
+
+    seed: int = Field(0, ge=0)
+    members: int = Field(1, ge=1, le=16, description="heads trained from different seeds and averaged")
+    epochs: int = Field(8, ge=1)
+    batch: int = Field(16, ge=1)
+    learning_rate: float = Field(1e-3, gt=0)
+    weight_decay: float = Field(0.05, ge=0)
+    backbone: str | None = Field(None, description="weights file; the cached one if absent")
+    output: str = Field(description="file the head is written to")
+    data: DataConfig
+    head: HeadConfig = HeadConfig()
+    loss: LossConfig = LossConfig()
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> TrainConfig:
+        """Read and validate ``path``.
+
+        Raises:
+            ConfigError: the file cannot be read, or a setting is unknown, missing or out
+                of range; names it.
+        """
+        path = Path(path)
+        try:
+            loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot read the settings: {error.strerror}") from error
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: not valid YAML: {str(error).splitlines()[0]}") from error
+        return cls.from_dict(loaded if loaded is not None else {}, origin=str(path))
+
+    @classmethod
+    def from_dict(cls, values: Any, origin: str = "settings") -> TrainConfig:
+        """Validate nested ``values``; ``origin`` is named in errors.
+
+        Raises:
+            ConfigError: a setting is unknown, missing or out of range; names it.
+        """
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            problem = error.errors()[0]
+            name = ".".join(str(part) for part in problem["loc"]) or "(top level)"
+            what = "unknown setting" if problem["type"] == "extra_forbidden" else problem["msg"]
+            raise ConfigError(f"{origin}: setting '{name}': {what}") from error
+
+
+def digest(section: BaseModel, *more: object) -> str:
+    """Short hash of settings (and more), which names caches and checkpoints made with them."""
+    text = json.dumps([section.model_dump(mode="json"), [str(item) for item in more]], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files in and out: TUM trajectories, images, text and JSON."""
+
+from __future__ import annotations
+
+from slamdepth.io.images import read_depth_m, read_depth_raw, read_image_rgb
+from slamdepth.io.text import parse_float, read_lines, replacing, write_json, write_text
+from slamdepth.io.trajectory import (
+    TrajectoryWriter,
+    format_timestamp,
+    read_tum_trajectory,
+    write_tum_trajectory,
+)
+
+__all__ = [
+    "TrajectoryWriter",
+    "format_timestamp",
+    "parse_float",
+    "read_depth_m",
+    "read_depth_raw",
+    "read_image_rgb",
+    "read_lines",
+    "read_tum_trajectory",
+    "replacing",
+    "write_json",
+    "write_text",
+    "write_tum_trajectory",
+]

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Colour and depth images in; what does not decode whole is an error, never a grey patch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slamdepth.errors import ImageDecodeError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+_PNG_END = b"IEND\xaeB`\x82"
+_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9"
+
+
+def read_image_rgb(path: str | Path) -> NDArray[np.uint8]:
+    """Read a colour image as ``(H, W, 3)`` uint8 RGB.
+
+    Grey images get three equal channels; a rotation noted in EXIF is not applied, since
+    intrinsics belong to the pixels as they were taken.
+
+    Raises:
+        ImageDecodeError: the file is missing, empty, cut short or no image.
+    """
+    import cv2
+
+    image = _decode(Path(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def read_depth_raw(path: str | Path) -> NDArray[np.uint16]:
+    """Read a 16-bit depth image as ``(H, W)`` uint16 in the units of its file.
+
+    Raises:
+        ImageDecodeError: the file is missing, empty, cut short, or no 16-bit image of one channel.
+    """
+    import cv2
+
+    raw = _decode(Path(path), cv2.IMREAD_UNCHANGED)
+    if raw.ndim != 2 or raw.dtype != np.uint16:
+        raise ImageDecodeError(
+            f"{path}: a depth image has one channel of 16 bits, this is {raw.shape} {raw.dtype}"
+        )
+    return raw
+
+
+def read_depth_m(
+    path: str | Path, depth_factor: float, *, unknown_raw: Sequence[int] = ()
+) -> NDArray[np.float32]:
+    """Read a 16-bit depth image as ``(H, W)`` float32 metres, 0 where unknown.
+
+    Args:
+        path: the image.
+        depth_factor: raw units per metre.
+        unknown_raw: raw values that mean unknown, beside 0.
+
+    Raises:
+        ImageDecodeError: as :func:`read_depth_raw`.
+    """
+    raw = read_depth_raw(path)
+    depth_m = raw.astype(np.float32) / np.float32(depth_factor)
+    for value in unknown_raw:
+        depth_m[raw == value] = 0.0
+    return depth_m
+
+
+def _decode(path: Path, flags: int) -> NDArray[Any]:
+    import cv2
+
+    try:
+        data = path.read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: a null byte in the name
+        reason = getattr(error, "strerror", None) or error
+        raise ImageDecodeError(f"{path}: cannot be read: {reason}") from error
+    if not data:
+        raise ImageDecodeError(f"{path}: the image is empty (0 bytes)")
+    # OpenCV fills the missing rows of a cut image with grey and says nothing. Inside a scan
+    # of a JPEG 0xff is always escaped, so the end marker behind the last scan is the real one.
+    if (data.startswith(_PNG_START) and _PNG_END not in data[-4096:]) or (
+        data.startswith(_JPEG_START) and data.rfind(_JPEG_END) < data.rfind(_JPEG_SCAN)
+    ):
+        raise ImageDecodeError(f"{path}: the image is cut short ({len(data)} bytes)")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    except cv2.error as error:
+        raise ImageDecodeError(f"{path}: the image does not decode: {error.err}") from error
+    if image is None:
+        raise ImageDecodeError(f"{path}: the image does not decode")
+    return image

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text and JSON files, and the way every file is written: whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slamdepth.errors import DatasetError, OutputError
+
+
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """The lines of a list file that say something, with their numbers from 1.
+
+    A byte order mark, CRLF, blank lines and ``#`` comments are taken out; lines come
+    stripped.
+
+    Raises:
+        DatasetError: the file cannot be read.
+    """
+    try:
+        text = path.read_bytes().decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+    # Not str.splitlines: it also breaks at form feeds and the like, and editors don't count those.
+    stripped = ((number, line.strip()) for number, line in enumerate(re.split(r"\r\n|\r|\n", text), 1))
+    return [(number, line) for number, line in stripped if line and not line.startswith("#")]
+
+
+def parse_float(text: str) -> float:
+    """``float(text)`` without Python's ``1_000``, which no data file means.
+
+    Raises:
+        ValueError: ``text`` is no number.
+    """
+    if "_" in text:
+        raise ValueError(f"not a number: {text!r}")
+    return float(text)
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A temporary path with the same ending, moved to ``path`` when the block succeeds.
+
+    Raises:
+        OutputError: ``path`` cannot be written; nothing is left behind.
+    """
+    place = Path(path).absolute()
+    temporary = place.with_name(f".{place.stem}.{secrets.token_hex(4)}.partial{place.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, place)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):  # such as a folder that is no folder: that error is on its way
+            temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write ``text`` as UTF-8, whole or not at all.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+    """
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(text.encode("utf-8", errors="backslashreplace"))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write ``value`` as indented JSON, whole or not at all.
+
+    NumPy scalars and arrays, paths, enums, sets and tuples become what JSON has; NaN and
+    infinities become null, since JSON has neither.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+        TypeError: ``value`` holds something with no meaning in JSON.
+    """
+    write_text(path, json.dumps(_jsonable(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def _jsonable(value: Any) -> Any:
+    if isinstance(value, Enum):
+        return _jsonable(value.value)
+    if isinstance(value, np.ndarray | np.generic):
+        return _jsonable(value.tolist())
+    if isinstance(value, dict):
+        return {str(_jsonable(key)): _jsonable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_jsonable(item) for item in value]
+    if isinstance(value, set | frozenset):
+        return sorted(_jsonable(item) for item in value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coloured triangle meshes, and their files."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slamdepth.errors import OutputError
+from slamdepth.io import replacing
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MESH_ENDINGS = (".ply", ".obj", ".glb")
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """A mesh in the world frame.
+
+    Attributes:
+        vertices_m: ``(V, 3)`` float32 metres of the map.
+        triangles: ``(T, 3)`` int32 vertex numbers, counter-clockwise seen from outside.
+        colors: ``(V, 3)`` float32 sRGB, 0 to 1.
+        notes: what was guessed or cut while it was made, one line each.
+    """
+
+    vertices_m: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    colors: NDArray[np.float32]
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        count = len(self.vertices_m)
+        if self.vertices_m.shape != (count, 3) or self.colors.shape != (count, 3):
+            raise ValueError(
+                f"a mesh needs (V, 3) vertices and colours, got {self.vertices_m.shape}, {self.colors.shape}"
+            )
+        if self.triangles.shape != (len(self.triangles), 3):
+            raise ValueError(f"a mesh needs (T, 3) triangles, got {self.triangles.shape}")
+        if len(self.triangles) and not 0 <= self.triangles.min() <= self.triangles.max() < count:
+            raise ValueError(f"a triangle names a vertex outside 0 to {count - 1}")
+
+    @classmethod
+    def empty(cls, *notes: str) -> TriangleMesh:
+        """A mesh of nothing."""
+        none = np.zeros((0, 3), np.float32)
+        return cls(none, np.zeros((0, 3), np.int32), none, notes)
+
+
+def check_mesh_path(path: str | Path) -> None:
+    """Tell early whether :func:`write_mesh` knows the ending of ``path``.
+
+    Raises:
+        OutputError: it does not; lists those it knows.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in MESH_ENDINGS:
+        raise OutputError(f"{path}: a mesh file must end in one of {', '.join(MESH_ENDINGS)}")
+
+
+def write_mesh(path: str | Path, mesh: TriangleMesh) -> None:
+    """Write a mesh as binary PLY, OBJ (colours behind the positions) or GLB, by the ending of ``path``.
+
+    The file is written whole or not at all. PLY and OBJ keep the world frame (y down when the
+    first camera is level); GLB, whose viewers expect y up, is turned by its scene node.
+
+    Raises:
+        OutputError: an ending other than these, or ``path`` cannot be written.
+    """
+    path = Path(path)
+    check_mesh_path(path)
+    encode = {".ply": _ply, ".obj": _obj, ".glb": _glb}[path.suffix.lower()]
+    data = encode(mesh)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def _bytes_of(colors: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.round(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def _ply(mesh: TriangleMesh) -> bytes:
+    vertices = np.empty(len(mesh.vertices_m), [("position", "<f4", 3), ("color", "u1", 3)])
+    vertices["position"], vertices["color"] = mesh.vertices_m, _bytes_of(mesh.colors)
+    faces = np.empty(len(mesh.triangles), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.triangles
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    return ("\n".join(header) + "\n").encode("ascii") + vertices.tobytes() + faces.tobytes()
+
+
+def _obj(mesh: TriangleMesh) -> bytes:
+    colors = _bytes_of(mesh.colors) / 255.0
+    lines = ["# vertices: x y z r g b"]
+    lines += [
+        f"v {x:.6g} {y:.6g} {z:.6g} {r:.4f} {g:.4f} {b:.4f}"
+        for x, y, z, r, g, b in np.hstack([mesh.vertices_m, colors]).tolist()
+    ]
+    lines += [f"f {a} {b} {c}" for a, b, c in (mesh.triangles + 1).tolist()]
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def _glb(mesh: TriangleMesh) -> bytes:
+    """Binary glTF 2.0: one primitive with vertex colours, shown unlit."""
+    document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "slamdepth"}, "scene": 0}
+    binary = b""
+    if len(mesh.triangles) == 0:
+        document["scenes"] = [{"nodes": []}]  # glTF knows no empty mesh
+    else:
+        # glTF's colours are linear; 16 bits, or dark shades would merge.
+        srgb = np.clip(mesh.colors.astype(np.float64), 0.0, 1.0)
+        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        rgba = np.full((len(srgb), 4), 65535, "<u2")
+        rgba[:, :3] = np.round(linear * 65535.0)
+        parts = [
+            mesh.vertices_m.astype("<f4").tobytes(),
+            rgba.tobytes(),
+            mesh.triangles.astype("<u4").tobytes(),
+        ]
+        binary = b"".join(parts)
+        starts = [0, len(parts[0]), len(parts[0]) + len(parts[1])]
+        array_buffer, element_array_buffer = 34962, 34963
+        float_, unsigned_short, unsigned_int = 5126, 5123, 5125
+        document |= {
+            "extensionsUsed": ["KHR_materials_unlit"],
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "rotation": [1.0, 0.0, 0.0, 0.0]}],  # half a turn about x: y up
+            "meshes": [
+                {"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}
+            ],
+            "materials": [
+                {
+                    "doubleSided": True,
+                    "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+                    "extensions": {"KHR_materials_unlit": {}},
+                }
+            ],
+            "buffers": [{"byteLength": len(binary)}],
+            "bufferViews": [
+                {"buffer": 0, "byteOffset": start, "byteLength": len(part), "target": target}
+                for start, part, target in zip(
+                    starts, parts, (array_buffer, array_buffer, element_array_buffer), strict=True
+                )
+            ],
+            "accessors": [
+                {
+                    "bufferView": 0, "componentType": float_, "count": len(srgb), "type": "VEC3",
+                    "min": mesh.vertices_m.min(axis=0).tolist(), "max": mesh.vertices_m.max(axis=0).tolist(),
+                },
+                {
+                    "bufferView": 1, "componentType": unsigned_short, "normalized": True,
+                    "count": len(srgb), "type": "VEC4",
+                },
+                {
+                    "bufferView": 2, "componentType": unsigned_int,
+                    "count": 3 * len(mesh.triangles), "type": "SCALAR",
+                },
+            ],
+        }  # fmt: skip
+    text = json.dumps(document, separators=(",", ":")).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    if binary:
+        chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

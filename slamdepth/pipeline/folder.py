@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The run folder: where it lies, what is in it, and its log."""
+
+from __future__ import annotations
+
+import logging
+import logging.handlers
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from slamdepth.errors import OutputError
+from slamdepth.io import write_text
+
+FILES = {
+    "trajectory.txt": "every placed frame after optimisation (TUM format, camera to world)",
+    "trajectory_online.txt": "each frame's pose as it was first placed, written while the run went on",
+    "keyframes.txt": "the keyframes of trajectory.txt",
+    "mesh.ply": "coloured mesh of the scene in the frame of the first camera, metres",
+    "report.html": "figures and plots of the run; opens in any browser, needs nothing else",
+    "report.json": "the same figures for programs",
+    "config.yaml": "the settings used; give it to --config for the same run again",
+    "log.txt": "what happened, in detail",
+    "README.txt": "this list",
+}
+"""What each file of a run folder holds."""
+
+_README = "README.txt"
+_MARK = "A run of slamdepth"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A place for the results of one run; nothing is made before :meth:`create`."""
+
+    path: Path
+    replaces: bool = False
+
+    @classmethod
+    def plan(cls, output: Path | None, sequence_name: str, *, overwrite: bool) -> RunFolder:
+        """Choose and check the place.
+
+        Raises:
+            OutputError: it is a file, holds something already, or cannot be written.
+        """
+        if output is None:
+            stem = f"{sequence_name}-{time.strftime('%Y%m%d-%H%M%S')}"
+            path = Path("runs") / stem
+            number = 2
+            while path.exists():
+                path = Path("runs") / f"{stem}-{number}"
+                number += 1
+            return cls(_writable(path))
+        path = Path(output).expanduser()
+        try:
+            if path.exists() and not path.is_dir():
+                raise OutputError(f"{path}: is a file; name a folder for the results")
+            if not (path.is_dir() and any(path.iterdir())):
+                return cls(_writable(path))
+            if not _is_run(path):
+                raise OutputError(f"{path}: is not empty and holds no earlier run; name a new folder")
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from error
+        if not overwrite:
+            raise OutputError(f"{path}: holds an earlier run; name another folder or add --overwrite")
+        return cls(_writable(path), replaces=True)
+
+    def create(self) -> None:
+        """Make the folder, empty of the files of an earlier run, and its README.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            if self.replaces:
+                for name in FILES:
+                    (self.path / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+        width = max(map(len, FILES))
+        lines = [f"{name:<{width}}  {what}" for name, what in FILES.items()]
+        head = f"{_MARK}. A file that is missing was not asked for, or the run was killed before it.\n\n"
+        write_text(self.path / _README, head + "\n".join(lines) + "\n")
+
+    def discard(self) -> None:
+        """Remove our files, and the folder where nothing else is in it."""
+        with suppress(OSError):
+            for name in FILES:
+                (self.path / name).unlink(missing_ok=True)
+            self.path.rmdir()
+
+    def __truediv__(self, name: str) -> Path:
+        return self.path / name
+
+
+@contextmanager
+def run_log() -> Iterator[logging.handlers.MemoryHandler]:
+    """Collect slamdepth's messages of every level; :func:`write_log_to` gives them a file."""
+    package = logging.getLogger("slamdepth")
+    level = package.level
+    # Kept in memory until there is a run folder: bad input must not leave one behind.
+    buffer = logging.handlers.MemoryHandler(capacity=10_000, flushLevel=logging.CRITICAL + 1)
+    buffer.setLevel(logging.DEBUG)
+    package.addHandler(buffer)
+    package.setLevel(logging.DEBUG)
+    try:
+        yield buffer
+    finally:
+        package.removeHandler(buffer)
+        package.setLevel(level)
+        target = buffer.target
+        buffer.close()
+        if target is not None:
+            target.close()
+
+
+def write_log_to(buffer: logging.handlers.MemoryHandler, path: Path) -> None:
+    """Write the messages so far and all later ones to ``path``.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+    """
+    try:
+        file = logging.FileHandler(path, mode="w", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
+    buffer.setTarget(file)
+    buffer.flush()
+    buffer.flushLevel = logging.DEBUG  # from now on line by line, so that a killed run leaves its log
+
+
+def _is_run(path: Path) -> bool:
+    try:
+        return (path / _README).read_text(encoding="utf-8").startswith(_MARK)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _writable(path: Path) -> Path:
+    """``path``, if it or the nearest folder above it that exists can be written."""
+    place = path.absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    if not place.is_dir():
+        raise OutputError(f"{path}: cannot be written: {place} is a file")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise OutputError(f"{path}: cannot be written: no permission to write to {place}")
+    return path

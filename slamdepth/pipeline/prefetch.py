@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames read ahead in a thread, in order, so that decoding does not wait for tracking."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from types import TracebackType
+
+import numpy as np
+
+from slamdepth.datasets import Dataset
+from slamdepth.errors import ImageDecodeError
+from slamdepth.types import Frame
+
+logger = logging.getLogger(__name__)
+
+_POLL_S = 0.1
+
+
+class FramePrefetcher:
+    """Iterates over frames of a dataset; a few are read ahead, so memory is bounded.
+
+    Use it as a context manager: leaving it ends the thread.
+
+    Args:
+        dataset: the sequence.
+        indices: which frames, in the order they come out.
+        with_depth: also read the sensor depth. A frame whose depth is missing or does not
+            decode comes with depth 0 everywhere, which means unknown.
+        capacity: frames read ahead.
+    """
+
+    def __init__(
+        self, dataset: Dataset, indices: Sequence[int], *, with_depth: bool, capacity: int = 4
+    ) -> None:
+        self._dataset = dataset
+        self._indices = indices
+        self._with_depth = with_depth
+        self._queue: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=capacity)
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._read_all, name="slamdepth-reader", daemon=True)
+        self.read_s = 0.0
+        self.frames_without_depth = 0
+
+    def __enter__(self) -> FramePrefetcher:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._closed.set()
+        self._thread.join()
+
+    def __iter__(self) -> Iterator[Frame | ImageDecodeError]:
+        """Each frame, or the error of an image that does not decode.
+
+        Raises:
+            CameraError: the size of an image is not the camera's.
+        """
+        while (item := self._queue.get()) is not None:
+            if isinstance(item, Exception) and not isinstance(item, ImageDecodeError):
+                raise item
+            yield item
+
+    def _read_all(self) -> None:
+        for index in self._indices:
+            start = time.perf_counter()
+            try:
+                item: Frame | Exception = self._read(index)
+            except Exception as error:  # handed to the thread that iterates, which raises it
+                item = error
+            self.read_s += time.perf_counter() - start
+            if not self._put(item):
+                return
+        self._put(None)
+
+    def _read(self, index: int) -> Frame:
+        if not self._with_depth:
+            return self._dataset.read(index)
+        try:
+            frame = self._dataset.read(index, with_depth=True)
+        except ImageDecodeError as error:
+            frame = self._dataset.read(index)  # raises again where it is the colour image
+            logger.warning("depth of frame %d left out: %s", index, error)
+        if frame.depth_m is None:
+            self.frames_without_depth += 1
+            frame = replace(frame, depth_m=np.zeros(frame.image_rgb.shape[:2], np.float32))
+        return frame
+
+    def _put(self, item: Frame | Exception | None) -> bool:
+        while not self._closed.is_set():
+            try:
+                self._queue.put(item, timeout=_POLL_S)
+                return True
+            except queue.Full:
+                continue
+        return False

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is made of a finished reconstruction: the mesh and the scores."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from slamdepth.config import Config
+from slamdepth.datasets import Dataset
+from slamdepth.depth.base import DepthModel
+from slamdepth.errors import DatasetError, ImageDecodeError
+from slamdepth.evaluation import DepthAccumulator, DepthScore, TrajectoryScore, score_trajectory
+from slamdepth.pipeline.options import ProgressCallback, RunProgress, Stage
+from slamdepth.report import MeshCounts
+from slamdepth.types import DepthKind, Keyframe, Reconstruction, Trajectory
+
+logger = logging.getLogger(__name__)
+
+
+def keyframe_trajectory(reconstruction: Reconstruction) -> Trajectory:
+    """The keyframes' poses as a trajectory."""
+    keyframes = reconstruction.keyframes
+    poses = [keyframe.T_world_camera for keyframe in keyframes]
+    return Trajectory(
+        np.array([keyframe.frame.timestamp_s for keyframe in keyframes], dtype=np.float64),
+        np.array(poses, dtype=np.float64).reshape(-1, 4, 4),
+        reconstruction.trajectory.is_metric,
+    )
+
+
+def write_keyframe_mesh(
+    reconstruction: Reconstruction, config: Config, path: Path, progress: ProgressCallback
+) -> tuple[MeshCounts | None, tuple[str, ...]]:
+    """Fuse the keyframes and write the mesh.
+
+    Returns:
+        Its size, or None where there is no surface and no file; and notes.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+    """
+    from slamdepth.mapping.mesh import write_mesh
+    from slamdepth.mapping.tsdf import fuse_keyframes
+
+    def tell(done: int, total: int) -> None:
+        progress(RunProgress(Stage.MESHING, done, total))
+
+    mesh = fuse_keyframes(reconstruction.keyframes, config.map, tell)
+    if len(mesh.triangles) == 0:
+        return None, mesh.notes
+    write_mesh(path, mesh)
+    return MeshCounts(len(mesh.vertices_m), len(mesh.triangles)), mesh.notes
+
+
+def judge_trajectory(
+    dataset: Dataset, estimate: Trajectory
+) -> tuple[TrajectoryScore | None, tuple[str, ...]]:
+    """Score against the ground truth where there is one; trouble becomes a note."""
+    if dataset.ground_truth is None:
+        return None, ()
+    try:
+        return score_trajectory(dataset.ground_truth, estimate), ()
+    except DatasetError as error:
+        logger.warning("the trajectory is not scored: %s", error)
+        return None, (f"the trajectory is not scored: {error}",)
+
+
+def judge_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore | None:
+    """Compare the keyframes' predicted depth, before any scaling, with the sensor's."""
+    if not dataset.has_depth:
+        return None
+    judged = DepthAccumulator()
+    for keyframe in keyframes:
+        if keyframe.prediction.is_sensor or keyframe.prediction.kind is not DepthKind.METRIC:
+            continue
+        try:
+            sensor_m = dataset.read(keyframe.frame.index, with_depth=True).depth_m
+        except ImageDecodeError as error:
+            logger.debug("keyframe %d is not judged: %s", keyframe.id, error)
+            continue
+        if sensor_m is not None:
+            judged.add(keyframe.prediction.values, sensor_m)
+    return judged.score()
+
+
+def scale_sentence(model: DepthModel, keyframes: tuple[Keyframe, ...]) -> str:
+    """Is the map metric, and how was its scale found."""
+    if any(keyframe.prediction.is_sensor for keyframe in keyframes):
+        return "metric, measured by the depth sensor"
+    if model.kind is DepthKind.METRIC:
+        return f"metric as far as the depth predicted by {model.name} is; no sensor measured it"
+    return f"unknown: {model.name} predicts depth up to scale, so lengths have no unit"

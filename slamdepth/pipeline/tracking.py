@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Feeding a tracker: frames in, results and the growing trajectory out."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+from slamdepth.datasets import Dataset
+from slamdepth.errors import DatasetError, ImageDecodeError
+from slamdepth.io import TrajectoryWriter
+from slamdepth.pipeline.options import ProgressCallback, RunInterrupted, RunProgress, Stage
+from slamdepth.pipeline.prefetch import FramePrefetcher
+from slamdepth.types import Frame, Reconstruction, StepResult
+
+logger = logging.getLogger(__name__)
+
+_WARNINGS = 5  # images named one by one before only their number is told
+
+
+class AnyTracker(Protocol):
+    """What the pipeline needs of a tracker."""
+
+    def step(self, frame: Frame) -> StepResult: ...
+
+    def finish(self) -> Reconstruction: ...
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A tracked sequence.
+
+    Attributes:
+        fps: frames over the wall time from the first step to the end of the optimisation.
+        skipped: images that did not decode.
+        interrupted: True where it was stopped before the last frame.
+        notes: what a reader of the report should know, one line each.
+    """
+
+    reconstruction: Reconstruction
+    steps: tuple[StepResult, ...]
+    fps: float
+    skipped: int
+    interrupted: bool
+    notes: tuple[str, ...]
+
+
+def track(
+    dataset: Dataset,
+    indices: Sequence[int],
+    tracker: AnyTracker,
+    online_path: Path,
+    *,
+    with_depth: bool,
+    progress: ProgressCallback,
+    stop: threading.Event,
+) -> Tracked:
+    """Feed the frames to ``tracker`` until the last one or until ``stop`` is set, and finish it.
+
+    Raises:
+        DatasetError: more than half of the images do not decode.
+        CameraError: the size of an image is not the camera's.
+        RunInterrupted: ``stop`` was set before the first frame.
+        OutputError: ``online_path`` cannot be written.
+    """
+    steps: list[StepResult] = []
+    skipped = 0
+    start_s: float | None = None
+    total = len(indices)
+    reader = FramePrefetcher(dataset, indices, with_depth=with_depth)
+    progress(RunProgress(Stage.TRACKING, 0, total))
+    with reader, TrajectoryWriter(online_path) as online:
+        for item in reader:
+            if stop.is_set():
+                break
+            if isinstance(item, ImageDecodeError):
+                skipped += 1
+                _warn(item, skipped)
+                if 2 * skipped > total:
+                    raise DatasetError(
+                        f"{dataset.path}: more than half of the images do not decode "
+                        f"({skipped} of the first {skipped + len(steps)}); the last: {item}"
+                    )
+                continue
+            if start_s is None:
+                start_s = time.perf_counter()
+            result = tracker.step(item)
+            steps.append(result)
+            if result.T_world_camera is not None:
+                online.append(result.timestamp_s, result.T_world_camera)
+            progress(_state(result, len(steps) + skipped, total, len(steps), start_s))
+    if start_s is None:
+        if stop.is_set():
+            raise RunInterrupted("interrupted before the first frame; nothing was saved")
+        raise DatasetError(f"{dataset.path}: none of the {total} images decodes")
+
+    interrupted = len(steps) + skipped < total
+    progress(replace(_state(steps[-1], len(steps) + skipped, total, len(steps), start_s), stage=Stage.OPTIMISING))
+    finish_s = time.perf_counter()
+    reconstruction = tracker.finish()
+    end_s = time.perf_counter()
+    timings_ms = {
+        **reconstruction.timings_ms,
+        "finish": 1e3 * (end_s - finish_s),
+        "decode": 1e3 * reader.read_s / max(1, len(steps)),
+    }
+    notes: list[str] = []
+    if interrupted:
+        notes.append(f"interrupted after {len(steps) + skipped} of {total} frames")
+    if skipped:
+        notes.append(f"{skipped} of {total} images do not decode and were skipped")
+    if reader.frames_without_depth:
+        notes.append(f"{reader.frames_without_depth} frames have no sensor depth of their time")
+    for note in notes:
+        logger.warning("%s", note)
+    return Tracked(
+        replace(reconstruction, timings_ms=timings_ms),
+        tuple(steps),
+        len(steps) / (end_s - start_s),
+        skipped,
+        interrupted,
+        tuple(notes),
+    )
+
+
+def _warn(error: ImageDecodeError, count: int) -> None:
+    level = logging.WARNING if count <= _WARNINGS else logging.DEBUG
+    logger.log(level, "image skipped: %s", error)
+    if count == _WARNINGS:
+        logger.warning("further images that do not decode are only counted")
+
+
+def _state(result: StepResult, done: int, total: int, frames: int, start_s: float) -> RunProgress:
+    return RunProgress(
+        Stage.TRACKING,
+        done,
+        total,
+        frames / max(1e-9, time.perf_counter() - start_s),
+        result.status,
+        result.keyframes,
+        result.loop_closures,
+    )

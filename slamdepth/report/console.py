@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables for a terminal, built here and printed by the command line."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from slamdepth.report.text import MISSING, count, fixed, percent
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    Rows = list[tuple[str, str]]
+
+
+def run_table(summary: dict[str, Any], places: dict[str, str] | None = None) -> Table:
+    """What a run ends with.
+
+    Args:
+        summary: of :func:`slamdepth.report.build_summary`.
+        places: name of a result to where it lies, appended as rows.
+    """
+    rows = [
+        ("frames", count(summary["frames"])),
+        ("tracked", f"{count(summary['tracked'])} ({percent(summary['tracked_fraction'])})"),
+        ("frames per second", fixed(summary["fps"], 1)),
+        ("keyframes", count(summary["keyframes"])),
+        ("loop closures", count(summary["loop_closures"])),
+        ("relocalisations", count(summary["relocalisations"])),
+        ("scale", summary["scale"]),
+    ]
+    if summary["skipped_frames"]:
+        rows.insert(1, ("images skipped", count(summary["skipped_frames"])))
+    is_scored = summary["ate"]["se3"]["rmse_m"] is not None
+    rows += _score_rows(summary, 4) if is_scored else [("ATE, RPE", "not scored")]
+    depth = summary["depth"]["metric"]
+    if depth["abs_rel"] is not None:
+        rows.append(("depth", f"AbsRel {fixed(depth['abs_rel'], 3)}, δ < 1.25: {percent(depth['delta1'])}"))
+    mesh = summary["mesh"]
+    if mesh["vertices"] is not None:
+        rows.append(("mesh", f"{count(mesh['vertices'])} vertices, {count(mesh['triangles'])} triangles"))
+    rows += list((places or {}).items())
+    return _two_columns(f"{summary['sequence']} · depth: {summary['depth_model']}", rows)
+
+
+def trajectory_table(figures: dict[str, Any], title: str = "trajectory", digits: int = 6) -> Table:
+    """The figures of ``TrajectoryScore.to_dict()``, lengths with so many digits after the point."""
+    return _two_columns(title, _score_rows(figures, digits))
+
+
+def depth_table(figures: dict[str, Any], title: str = "depth against the sensor") -> Table:
+    """The figures of ``DepthScore.to_dict()``, judged three ways."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(title, style="bold"), title_justify="left", box=box.SIMPLE)
+    table.add_column("scaled")
+    for name in ("AbsRel", "RMSE", "δ < 1.25"):
+        table.add_column(name, justify="right")
+    ways = (("metric", "as predicted"), ("sequence_median", "once"), ("frame_median", "each frame"))
+    for key, label in ways:
+        errors = figures[key]
+        rmse = fixed(errors["rmse_m"], 3, "m")
+        table.add_row(label, fixed(errors["abs_rel"], 3), rmse, fixed(errors["delta1"], 3))
+    return table
+
+
+def _score_rows(figures: dict[str, Any], digits: int) -> Rows:
+    ate, rpe = figures["ate"], figures["rpe"]
+    factor = fixed(ate["sim3"]["scale"], digits)
+    matched = f"{count(ate['matched_poses'])} of {count(ate['estimate_poses'])} estimated"
+    rows = [
+        ("poses compared", f"{matched}, within {ate['max_difference_s']:g} s"),
+        ("ATE RMSE, SE(3)", fixed(ate["se3"]["rmse_m"], digits, "m")),
+        ("ATE RMSE, Sim(3)", f"{fixed(ate['sim3']['rmse_m'], digits, 'm')} (scale × {factor})"),
+    ]
+    for key, label in (("per_frame", "RPE per frame"), ("per_second", "RPE per second")):
+        trans, rot = rpe[key]["trans_rmse_m"], rpe[key]["rot_rmse_deg"]
+        value = MISSING if trans is None else f"{fixed(trans, digits, 'm')}, {fixed(rot, digits, '°')}"
+        rows.append((label, value))
+    return rows
+
+
+def _two_columns(title: str, rows: Rows) -> Table:
+    """Texts are shown as they are: a path with brackets is no markup."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(title, style="bold"), title_justify="left", box=box.SIMPLE, show_header=False)
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in rows:
+        table.add_row(Text(name), Text(value))
+    return table

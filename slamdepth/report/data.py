@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a finished run hands to its report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from slamdepth.config import Config
+from slamdepth.evaluation import DepthScore, TrajectoryScore
+from slamdepth.types import Reconstruction, StepResult, WeightsInfo
+
+
+@dataclass(frozen=True)
+class MeshCounts:
+    """Size of the mesh that was written."""
+
+    vertices: int
+    triangles: int
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """Everything the report of one run states.
+
+    Attributes:
+        sequence: name of the sequence, not its path.
+        depth_model: registered name of the depth model, or ``sensor``.
+        reconstruction: what the tracker returned.
+        fps: frames over the wall time of tracking, meshing apart.
+        config: every setting of the run.
+        scale: one sentence: is the map metric, and how was its scale found.
+        weights: every weights file that took part, and the data each has seen.
+        steps: one result for each frame, in order; empty where they were not kept.
+        trajectory_score, depth_score, mesh: None where there is none.
+        skipped_frames: images that could not be decoded.
+        notes: what was guessed, dropped or repaired, one line each.
+        options: what was asked on the command line beside the settings.
+        files: what each file of the run folder holds, by file name.
+    """
+
+    sequence: str
+    depth_model: str
+    reconstruction: Reconstruction
+    fps: float
+    config: Config
+    scale: str
+    weights: tuple[WeightsInfo, ...] = ()
+    steps: tuple[StepResult, ...] = ()
+    trajectory_score: TrajectoryScore | None = None
+    depth_score: DepthScore | None = None
+    mesh: MeshCounts | None = None
+    skipped_frames: int = 0
+    notes: tuple[str, ...] = ()
+    options: dict[str, object] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes as small pictures: the image, its depth in colour, and the sensor's where there is one."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from slamdepth.types import Keyframe
+
+NEAR_TO_FAR = ("#0b1457", "#17458f", "#11787f", "#2f9e4f", "#98c83a", "#fbe743")
+"""Depth from near (dark blue) over green to far (yellow), evenly spaced."""
+
+UNKNOWN = "#808080"
+_WIDTH_PX = 320
+
+
+@dataclass(frozen=True)
+class KeyframePicture:
+    """Pictures of one keyframe as ``data:`` addresses.
+
+    Attributes:
+        seconds: since the first keyframe.
+        sensor: None where there is no sensor, or where ``depth`` is its own.
+    """
+
+    id: int
+    seconds: float
+    image: str
+    depth: str
+    sensor: str | None
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Pictures of some keyframes under one colour scale from ``near_m`` to ``far_m``."""
+
+    pictures: tuple[KeyframePicture, ...]
+    near_m: float
+    far_m: float
+
+
+def colour_depth(depth_m: NDArray[np.floating], near_m: float, far_m: float) -> NDArray[np.uint8]:
+    """Colours ``(H, W, 3)`` RGB of depth ``(H, W)`` in metres; grey where it is 0 or not finite."""
+    anchors = np.array([_rgb(colour) for colour in NEAR_TO_FAR], dtype=np.float64)
+    known = np.isfinite(depth_m) & (depth_m > 0)
+    position = np.clip((np.where(known, depth_m, near_m) - near_m) / max(far_m - near_m, 1e-9), 0.0, 1.0)
+    levels = np.linspace(0.0, 1.0, len(anchors))
+    table_at = np.linspace(0.0, 1.0, 256)
+    channels = [np.interp(table_at, levels, channel).round() for channel in anchors.T]
+    coloured = np.stack(channels, axis=1).astype(np.uint8)[np.round(position * 255).astype(np.int64)]
+    coloured[~known] = _rgb(UNKNOWN)
+    return coloured
+
+
+def keyframe_gallery(keyframes: tuple[Keyframe, ...], count: int = 4) -> Gallery | None:
+    """Pictures of ``count`` keyframes spread evenly over the run, or None where there are none."""
+    if not keyframes:
+        return None
+    spread = np.linspace(0, len(keyframes) - 1, count).round().astype(int)
+    chosen = [keyframes[i] for i in sorted(set(spread.tolist()))]
+    known = np.concatenate([k.depth_m[np.isfinite(k.depth_m) & (k.depth_m > 0)][::16] for k in chosen])
+    near_m, far_m = (float(v) for v in np.percentile(known, (1, 98))) if len(known) else (0.0, 1.0)
+    start_s = keyframes[0].frame.timestamp_s
+    pictures = tuple(_picture(k, start_s, near_m, far_m) for k in chosen)
+    return Gallery(pictures, near_m, far_m)
+
+
+def _picture(keyframe: Keyframe, start_s: float, near_m: float, far_m: float) -> KeyframePicture:
+    sensor_m = None if keyframe.prediction.is_sensor else keyframe.frame.depth_m
+    return KeyframePicture(
+        id=keyframe.id,
+        seconds=keyframe.frame.timestamp_s - start_s,
+        image=_jpeg(keyframe.frame.image_rgb, smooth=True),
+        depth=_jpeg(colour_depth(keyframe.depth_m, near_m, far_m), smooth=False),
+        sensor=None if sensor_m is None else _jpeg(colour_depth(sensor_m, near_m, far_m), smooth=False),
+    )
+
+
+def _jpeg(image_rgb: NDArray[np.uint8], *, smooth: bool) -> str:
+    import cv2
+
+    height, width = image_rgb.shape[:2]
+    size = (_WIDTH_PX, max(1, round(height * _WIDTH_PX / width)))
+    small = cv2.resize(image_rgb, size, interpolation=cv2.INTER_AREA if smooth else cv2.INTER_NEAREST)
+    _, data = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 84])
+    return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

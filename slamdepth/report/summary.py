@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures of a run as one nested dict: the content of ``report.json``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from slamdepth.evaluation import DepthScore, TrajectoryScore
+from slamdepth.report.data import ReportData
+from slamdepth.report.environment import hardware, versions
+
+
+def build_summary(data: ReportData) -> dict[str, Any]:
+    """Every key is always there; what could not be measured is None."""
+    run = data.reconstruction
+    return {
+        "sequence": data.sequence,
+        "depth_model": data.depth_model,
+        "scale": data.scale,
+        "frames": run.frames,
+        "tracked": run.tracked,
+        "tracked_fraction": run.tracked / run.frames if run.frames else None,
+        "skipped_frames": data.skipped_frames,
+        "keyframes": len(run.keyframes),
+        "loop_closures": run.loop_closures,
+        "relocalisations": run.relocalisations,
+        "rescues": run.rescues,
+        "fps": data.fps,
+        "timings_ms": dict(run.timings_ms),
+        **_trajectory(data.trajectory_score),
+        "depth": _depth(data.depth_score),
+        "mesh": {
+            "vertices": data.mesh.vertices if data.mesh else None,
+            "triangles": data.mesh.triangles if data.mesh else None,
+        },
+        "notes": [*data.notes, *run.notes],
+        "weights": [asdict(weights) for weights in data.weights],
+        "settings": data.config.model_dump(mode="json"),
+        "options": dict(data.options),
+        "versions": versions(),
+        "hardware": hardware(),
+    }
+
+
+def _trajectory(score: TrajectoryScore | None) -> dict[str, Any]:
+    if score is not None:
+        return score.to_dict()
+    absolute = dict.fromkeys(("rmse_m", "mean_m", "median_m", "max_m"))
+    relative = dict.fromkeys(("trans_rmse_m", "rot_rmse_deg", "delta_frames"))
+    counts = dict.fromkeys(
+        ("matched_poses", "estimate_poses", "ground_truth_poses", "max_difference_s", "path_length_m")
+    )
+    return {
+        "ate": {"se3": absolute, "sim3": {**absolute, "scale": None}, **counts},
+        "rpe": {"per_frame": relative, "per_second": dict(relative)},
+    }
+
+
+def _depth(score: DepthScore | None) -> dict[str, Any]:
+    if score is not None:
+        return score.to_dict()
+    names = ("abs_rel", "rmse_m", "log_rmse", "delta1", "delta2", "delta3")
+    ways = {way: dict.fromkeys(names) for way in ("metric", "sequence_median", "frame_median")}
+    rest = ("sequence_scale", "frame_scale_spread", "frames", "pixels", "coverage")
+    return {**ways, **dict.fromkeys(rest)}

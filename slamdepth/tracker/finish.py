@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The end of a run: one adjustment of everything, the metric scale, the result."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.config import Config
+from slamdepth.depth.alignment import apply_field, log_depth_of, sample
+from slamdepth.geometry import invert, transform
+from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.tracker.frame_log import FrameLog
+from slamdepth.tracker.local_mapper import LocalMapper
+from slamdepth.types import Keyframe, Reconstruction
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
+
+_MAX_KEYFRAMES = 600  # beyond, the reduced camera system outgrows a laptop's memory
+
+
+def optimise_everything(
+    landmarks: LandmarkMap, mapper: LocalMapper, frames: FrameLog, config: Config
+) -> list[str]:
+    """Global bundle adjustment, metric scale, and every frame placed anew; returns notes."""
+    notes = []
+    keyframes = landmarks.keyframes
+    if config.bundle.final and 3 <= len(keyframes) <= _MAX_KEYFRAMES:
+        rows = np.flatnonzero(landmarks.alive[: landmarks.size] & (landmarks.observations[: landmarks.size] >= 2))
+        mapper.adjust([k.id for k in keyframes], [], rows, (5, 8))
+    elif len(keyframes) > _MAX_KEYFRAMES:
+        notes.append(
+            f"the final adjustment of the whole map was left out: {len(keyframes)} keyframes, "
+            f"at most {_MAX_KEYFRAMES} fit"
+        )
+    prediction = keyframes[0].prediction
+    if prediction is not None and not prediction.is_sensor:
+        notes.append(_make_metric(landmarks, frames))
+    if config.bundle.final:
+        frames.refine()
+    return notes
+
+
+def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> str:
+    """Scale the map so that it agrees with the depth network over all keyframes, not with any one.
+
+    Each keyframe votes with the median log ratio of its map depths to its prediction; the
+    votes' median is taken out.
+    """
+    votes = np.array([v for k in landmarks.keyframes if (v := _scale_vote(landmarks, k)) is not None])
+    if len(votes) == 0:
+        return "scale: that of the first keyframe's predicted depth; no keyframe could vote"
+    offset = float(np.median(votes))
+    factor = float(np.exp(-offset))
+    n = landmarks.size
+    landmarks.position_w[:n] *= factor
+    landmarks.covariance_w[:n] *= factor**2
+    for keyframe in landmarks.keyframes:
+        keyframe.T_camera_world[:3, 3] *= factor
+        keyframe.log_depth -= offset
+        keyframe.scale *= factor
+    landmarks.refresh_views(np.arange(n))
+    frames.rescale(np.full(len(landmarks.keyframes), factor))
+    spread = float(np.std(votes))
+    return (
+        f"scale: from predicted depth, the median over {len(votes)} keyframes "
+        f"(their log ratios spread by {spread:.2f}); true metres may differ by some ten per cent"
+    )
+
+
+def _scale_vote(landmarks: LandmarkMap, keyframe: MapKeyframe) -> float | None:
+    assert keyframe.prediction is not None
+    log_map, _ = log_depth_of(keyframe.prediction)
+    at = np.flatnonzero(keyframe.point_ids >= 0)
+    rows = keyframe.point_ids[at]
+    at, rows = at[landmarks.observations[rows] >= 3], rows[landmarks.observations[rows] >= 3]
+    z = transform(keyframe.T_camera_world, landmarks.position_w[rows])[:, 2]
+    predicted = sample(log_map, keyframe.features.raw_px[at])
+    ok = (z > 0.05) & np.isfinite(predicted)
+    if np.count_nonzero(ok) < 20:
+        return None
+    return float(np.median(np.log(z[ok]) - predicted[ok]))
+
+
+def build_reconstruction(
+    landmarks: LandmarkMap,
+    mapper: LocalMapper,
+    frames: FrameLog,
+    *,
+    frames_total: int,
+    loop_closures: int,
+    relocalisations: int,
+    rescues: int,
+    timings_ms: dict[str, float],
+    notes: list[str],
+) -> Reconstruction:
+    """The value handed to the user."""
+    good = landmarks.alive[: landmarks.size] & (landmarks.observations[: landmarks.size] >= 2)
+    return Reconstruction(
+        trajectory=frames.trajectory(),
+        keyframes=tuple(_final(k, mapper) for k in landmarks.keyframes),
+        points_m=landmarks.position_w[: landmarks.size][good],
+        frames=frames_total,
+        tracked=len(frames),
+        loop_closures=loop_closures,
+        relocalisations=relocalisations,
+        rescues=rescues,
+        timings_ms=timings_ms,
+        notes=tuple(notes),
+    )
+
+
+def _final(keyframe: MapKeyframe, mapper: LocalMapper) -> Keyframe:
+    prediction = keyframe.prediction
+    assert prediction is not None
+    if prediction.is_sensor:
+        depth_m = prediction.values
+    else:
+        depth_m = apply_field(mapper.depth_field(keyframe), prediction)
+    return Keyframe(
+        id=keyframe.id,
+        frame=keyframe.frame,
+        T_world_camera=invert(keyframe.T_camera_world),
+        depth_m=depth_m,
+        sigma_log=prediction.sigma_log,
+        keypoints_px=keyframe.features.raw_px,
+        depth_scale=keyframe.scale,
+        prediction=prediction,
+    )

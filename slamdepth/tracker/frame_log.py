@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every placed frame, kept so that it follows the map wherever that moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.frontend.features import Features
+from slamdepth.frontend.pose import refine_pose
+from slamdepth.geometry import invert
+from slamdepth.mapping.landmarks import LandmarkMap
+from slamdepth.tracker.localiser import Placement
+from slamdepth.types import Camera, Trajectory
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+_MIN_MATCHES = 30
+_MAX_SHIFT_SHARE = 0.1  # of the scene's distance: a refinement is no relocation
+
+
+@dataclass
+class _Placed:
+    timestamp_s: float
+    keyframe: int
+    is_keyframe: bool
+    T_camera_keyframe: NDArray[np.float64]
+    rows: NDArray[np.int32]
+    px: NDArray[np.float32]
+    sigma_px: NDArray[np.float32]
+
+
+class FrameLog:
+    """Frames relative to their keyframe, with what they saw (kiss-slam's local frames)."""
+
+    def __init__(self, camera: Camera, landmarks: LandmarkMap) -> None:
+        self._camera = camera.without_distortion()
+        self._map = landmarks
+        self._placed: list[_Placed] = []
+
+    def __len__(self) -> int:
+        return len(self._placed)
+
+    def add(self, timestamp_s: float, features: Features, placement: Placement, is_keyframe: bool) -> None:
+        """Remember where a frame is, relative to the newest keyframe."""
+        reference = self._map.keyframes[-1]
+        at = np.flatnonzero(placement.point_ids >= 0)
+        self._placed.append(
+            _Placed(
+                timestamp_s,
+                reference.id,
+                is_keyframe,
+                placement.T_camera_world @ reference.T_world_camera,
+                placement.point_ids[at].astype(np.int32),
+                features.px[at].astype(np.float32),
+                features.sigma_px[at].astype(np.float32),
+            )
+        )
+
+    def rescale(self, scales: Floats) -> None:
+        """Multiply the metres of each keyframe ``(K,)`` in the frames that hang on it."""
+        for placed in self._placed:
+            placed.T_camera_keyframe[:3, 3] *= scales[placed.keyframe]
+
+    def T_camera_world(self, placed: _Placed) -> Floats:
+        return placed.T_camera_keyframe @ self._map.keyframes[placed.keyframe].T_camera_world
+
+    def refine(self) -> None:
+        """Place every ordinary frame anew in the final map, by what it saw.
+
+        A frame was placed when half of its points were young; by the end they are known
+        better, and the frame with them (motion-only bundle adjustment).
+        """
+        landmarks = self._map
+        for placed in self._placed:
+            keyframe = landmarks.keyframes[placed.keyframe]
+            if placed.is_keyframe:
+                placed.T_camera_keyframe = np.eye(4)
+                continue
+            rows = landmarks.resolve(placed.rows.astype(np.int64))
+            good = np.flatnonzero(rows >= 0)
+            good = good[landmarks.observations[rows[good]] >= 2]
+            if len(good) < _MIN_MATCHES:
+                continue
+            rows = rows[good]
+            start = self.T_camera_world(placed)
+            estimate = refine_pose(
+                self._camera,
+                start,
+                landmarks.position_w[rows],
+                landmarks.covariance_w[rows],
+                placed.px[good].astype(np.float64),
+                placed.sigma_px[good].astype(np.float64),
+                rounds=2,
+                iterations=3,
+            )
+            if np.count_nonzero(estimate.inliers) < 0.5 * len(good):
+                continue
+            distance = float(np.median(np.linalg.norm(landmarks.position_w[rows] - invert(start)[:3, 3], axis=1)))
+            moved = np.linalg.norm(invert(estimate.T_camera_world)[:3, 3] - invert(start)[:3, 3])
+            if moved < _MAX_SHIFT_SHARE * distance:
+                placed.T_camera_keyframe = estimate.T_camera_world @ keyframe.T_world_camera
+
+    def trajectory(self) -> Trajectory:
+        """All placed frames in the world; the first one is its origin."""
+        times = np.array([p.timestamp_s for p in self._placed])
+        T_camera_world = np.array([self.T_camera_world(p) for p in self._placed]).reshape(-1, 4, 4)
+        return Trajectory(times, invert(T_camera_world))

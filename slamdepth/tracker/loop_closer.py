@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Closing loops: a place seen before, verified by geometry, brought into one map."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.backend.places import PlaceRecogniser
+from slamdepth.backend.pose_graph import Edge, optimise_pose_graph
+from slamdepth.config import Config
+from slamdepth.geometry import invert, rotation_angle_rad, transform
+from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.tracker.localiser import Localiser, Placement
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
+
+_ALREADY_LINKED = 15  # shared points that make two keyframes neighbours
+_CANDIDATES = 2
+_MIN_SCORE_SHARE = 0.6  # of the likeness of two neighbours in time
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What a loop did to the map.
+
+    Attributes:
+        scales: ``(K,)`` factor each keyframe's metres were multiplied by.
+    """
+
+    scales: NDArray[np.float64]
+
+
+class LoopCloser:
+    """Finds loops of new keyframes and bends the map so that they close."""
+
+    def __init__(self, config: Config, landmarks: LandmarkMap, localiser: Localiser) -> None:
+        self._config = config
+        self._map = landmarks
+        self._localiser = localiser
+        self.places = PlaceRecogniser()
+        self._edges: list[Edge] = []
+        self.count = 0
+
+    def add(self, keyframe: MapKeyframe) -> None:
+        """Let the keyframe be found by later ones."""
+        self.places.add(keyframe.id, keyframe.features.descriptors)
+
+    def close(self, keyframe: MapKeyframe) -> Correction | None:
+        """Look for a loop at ``keyframe``; on success the map has been corrected."""
+        if not self._config.loops.enabled:
+            return None
+        for candidate in self._candidates(keyframe):
+            verified = self._verify(keyframe, candidate)
+            if verified is None:
+                continue
+            placement, scale = verified
+            correction = self._correct(keyframe, candidate, placement, scale)
+            if correction is not None:
+                self.count += 1
+                log.info("loop closed: keyframe %d sees the place of keyframe %d", keyframe.id, candidate)
+                return correction
+        return None
+
+    def _candidates(self, keyframe: MapKeyframe) -> list[int]:
+        newest = keyframe.id - self._config.loops.min_gap
+        if newest < 0:
+            return []
+        shared = self._map.shared_points(keyframe.point_ids)
+        exclude = {k for k in range(len(shared)) if k > newest or shared[k] >= _ALREADY_LINKED}
+        least = _MIN_SCORE_SHARE * self.places.score(keyframe.id, keyframe.id - 1)
+        answers = self.places.query_keyframe(keyframe.id, exclude=exclude, top_k=_CANDIDATES)
+        return [k for k, score in answers if score >= least]
+
+    def _verify(self, keyframe: MapKeyframe, candidate: int) -> tuple[Placement, float] | None:
+        placement = self._localiser.from_keyframe(keyframe.features, candidate, minimum=15)
+        if placement is None or placement.inliers < self._config.loops.min_inliers:
+            return None
+        both = np.flatnonzero((placement.point_ids >= 0) & (keyframe.point_ids >= 0))
+        both = both[placement.point_ids[both] != keyframe.point_ids[both]]
+        scale = 1.0
+        if not self._is_metric() and len(both) >= 10:
+            there = transform(placement.T_camera_world, self._map.position_w[placement.point_ids[both]])[:, 2]
+            here = transform(keyframe.T_camera_world, self._map.position_w[keyframe.point_ids[both]])[:, 2]
+            ok = (there > 0.05) & (here > 0.05)
+            if np.count_nonzero(ok) >= 10:
+                scale = float(np.exp(np.median(np.log(there[ok] / here[ok]))))
+        return placement, scale
+
+    def _is_metric(self) -> bool:
+        prediction = self._map.keyframes[0].prediction
+        return prediction is not None and prediction.is_sensor
+
+    def _correct(
+        self, keyframe: MapKeyframe, candidate: int, placement: Placement, scale: float
+    ) -> Correction | None:
+        other = self._map.keyframes[candidate]
+        T_loop = other.T_camera_world @ invert(placement.T_camera_world)
+        edge = Edge(candidate, keyframe.id, T_loop, scale, self._sigmas(), is_loop=True)
+        scales = np.ones(len(self._map.keyframes))
+        if self._is_off(keyframe, placement, scale):
+            edges = [*self._odometry_edges(), *self._edges, edge]
+            T_old = np.stack([k.T_world_camera for k in self._map.keyframes])
+            result = optimise_pose_graph(T_old, edges, with_scale=not self._is_metric())
+            if not result.is_inlier[-1]:
+                log.info("loop %d-%d refused by the pose graph", candidate, keyframe.id)
+                return None
+            scales = result.scales
+            self._bend(T_old, result.T_world_camera, scales)
+        self._edges.append(edge)
+        self._unite(keyframe, placement)
+        return Correction(scales)
+
+    def _is_off(self, keyframe: MapKeyframe, placement: Placement, scale: float) -> bool:
+        D = placement.T_camera_world @ keyframe.T_world_camera
+        far = float(np.linalg.norm(D[:3, 3])) > 0.02
+        return far or float(rotation_angle_rad(D[:3, :3])) > np.deg2rad(1.0) or abs(np.log(scale)) > 0.03
+
+    def _sigmas(self) -> tuple[float, float, float]:
+        return (0.01, 0.02, 0.03)
+
+    def _odometry_edges(self) -> list[Edge]:
+        """Neighbours in time, and every pair that shares many points: what holds the graph's shape."""
+        keyframes = self._map.keyframes
+        edges = []
+        for j, keyframe in enumerate(keyframes):
+            shared = self._map.shared_points(keyframe.point_ids[keyframe.point_ids >= 0])[:j]
+            partners = set(np.flatnonzero(shared >= 80).tolist()) if j else set()
+            if j:
+                partners.add(j - 1)
+            for i in sorted(partners):
+                T_i_j = keyframes[i].T_camera_world @ keyframe.T_world_camera
+                edges.append(Edge(i, j, T_i_j, 1.0, (0.01, 0.02, 0.02)))
+        return edges
+
+    def _bend(self, T_old: Floats, T_new: Floats, scales: Floats) -> None:
+        """Move points with the keyframe they were born in, and keyframes to their new poses."""
+        landmarks = self._map
+        birth = landmarks.birth_keyframe[: landmarks.size]
+        old_c = np.einsum(
+            "nij,nj->ni", invert(T_old)[birth][:, :3, :3], landmarks.position_w[: landmarks.size]
+        ) + invert(T_old)[birth][:, :3, 3]
+        old_c *= scales[birth][:, None]
+        landmarks.position_w[: landmarks.size] = (
+            np.einsum("nij,nj->ni", T_new[birth][:, :3, :3], old_c) + T_new[birth][:, :3, 3]
+        )
+        R = T_new[birth][:, :3, :3] @ np.swapaxes(T_old[birth][:, :3, :3], 1, 2)
+        landmarks.covariance_w[: landmarks.size] = (
+            R @ landmarks.covariance_w[: landmarks.size] @ np.swapaxes(R, 1, 2)
+        ) * (scales[birth] ** 2)[:, None, None]
+        for k, keyframe in enumerate(landmarks.keyframes):
+            keyframe.T_camera_world = invert(T_new[k])
+            keyframe.log_depth += np.log(scales[k])
+            keyframe.scale *= float(scales[k])
+        landmarks.refresh_views(np.arange(landmarks.size))
+
+    def _unite(self, keyframe: MapKeyframe, placement: Placement) -> None:
+        """What the keyframe sees as two points, once from each side of the loop, becomes one."""
+        landmarks = self._map
+        old, own = placement.point_ids, keyframe.point_ids
+        present = np.zeros(landmarks.size + 1, dtype=bool)
+        present[own] = True
+        fresh = np.flatnonzero((old >= 0) & (own < 0))
+        fresh = fresh[landmarks.alive[old[fresh]] & ~present[old[fresh]]]
+        own[fresh] = old[fresh]
+        landmarks.observations[old[fresh]] += 1
+        both = np.flatnonzero((old >= 0) & (own >= 0) & (old != own))
+        both = both[landmarks.alive[old[both]] & landmarks.alive[own[both]] & ~present[old[both]]]
+        landmarks.merge(own[both], old[both])

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``camera.yaml``: exact round trips, and errors that name file, key and the allowed keys."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from slamdepth.datasets import read_camera, write_camera
+from slamdepth.errors import CameraError
+from slamdepth.types import Camera
+
+RELAXED = settings(
+    deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60
+)
+GOOD = "width: 640\nheight: 480\nfx: 500\nfy: 501.5\ncx: 320\ncy: 240\n"
+
+
+def test_defaults_are_those_of_the_issue(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
+    camera = read_camera(path)
+    assert camera == Camera(640, 480, 500.0, 501.5, 320.0, 240.0)
+    assert camera.depth_factor == 5000.0
+    assert not camera.is_distorted
+
+
+positive = st.floats(1e-3, 1e5)
+anything = st.floats(-1e5, 1e5)
+
+
+@RELAXED
+@given(
+    camera=st.builds(
+        Camera,
+        width=st.integers(1, 10000),
+        height=st.integers(1, 10000),
+        fx=positive,
+        fy=positive,
+        cx=anything,
+        cy=anything,
+        distortion=st.tuples(*[anything] * 5),
+        depth_factor=positive,
+        fps=positive,
+    )
+)
+def test_round_trip(tmp_path: Path, camera: Camera) -> None:
+    write_camera(tmp_path / "camera.yaml", camera)
+    assert read_camera(tmp_path / "camera.yaml") == camera
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (GOOD + "focal: 3\n", "unknown key 'focal'; allowed are width, height, fx, fy, cx, cy, distortion,"),
+        (GOOD + "3: 3\n", "unknown key 3; allowed are width"),
+        (GOOD.replace("fy: 501.5\n", ""), "key fy missing; needed are width, height, fx, fy, cx, cy"),
+        ("width: 640\nheight: 480\n", "keys fx, fy, cx, cy missing"),
+        (GOOD.replace("640", "640.5"), "key 'width' must be a whole number of pixels, found 640.5"),
+        (GOOD.replace("640", "true"), "key 'width' must be a whole number"),
+        (GOOD.replace("501.5", "wide"), "key 'fy' must be a number such as 500.0, found 'wide'"),
+        (GOOD.replace("501.5", "yes"), "key 'fy' must be a number"),
+        (GOOD.replace("501.5", "null"), "key 'fy' must be a number"),
+        (GOOD.replace("501.5", "-1"), "fx and fy must be positive"),
+        (GOOD.replace("501.5", ".nan"), "must be finite"),
+        (GOOD.replace("501.5", "1" + "0" * 400), "key 'fy' is out of range"),
+        (GOOD.replace("640", "0"), "width and height must be positive"),
+        (GOOD + "distortion: [1, 2, 3, 4]\n", "key 'distortion' must be five numbers [k1, k2, p1, p2, k3]"),
+        (GOOD + "distortion: [1, 2, 3, 4, x]\n", "key 'distortion' must be a number"),
+        (GOOD + "depth_factor: 0\n", "depth_factor and fps must be positive"),
+        (GOOD + "fx: 501\n", "key 'fx' is given twice"),
+        ("", "expected lines 'key: value'"),
+        ("- 1\n", "expected lines 'key: value'"),
+        ("width: [\n", "not valid YAML"),
+        ("width: 2001-99-99\n", "not valid YAML"),
+    ],
+)
+def test_errors_name_file_and_key(tmp_path: Path, text: str, what: str) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(CameraError) as caught:
+        read_camera(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert what in message
+    assert "\n" not in message
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(CameraError, match=r"none\.yaml: cannot be read"):
+        read_camera(tmp_path / "none.yaml")
+
+
+@RELAXED
+@given(
+    st.one_of(st.binary(max_size=80), st.text(max_size=80).map(lambda text: text.encode("utf-8", "replace")))
+)
+def test_garbage_is_a_camera_error(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_bytes(data)
+    with pytest.raises(CameraError):
+        read_camera(path)
