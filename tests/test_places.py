@@ -184,7 +184,7 @@ def test_the_training_command_writes_a_vocabulary(tmp_path: Path) -> None:
     vocabulary = load_vocabulary(tmp_path / "v.npz")
     assert len(vocabulary) == 12
     assert "of 2 images" in vocabulary.description  # the left-out place does not count
-    with pytest.raises(OutputError, match="must be a .npz file"):
+    with pytest.raises(OutputError, match=r"must be a \.npz file"):
         main([*command, "--output", str(tmp_path / "v.txt")])
     with pytest.raises(DatasetError, match="no such folder"):
         main(["--data", str(tmp_path / "absent"), "--output", str(tmp_path / "v.npz")])

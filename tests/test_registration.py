@@ -16,7 +16,7 @@ from slamdepth.frontend.registration import (
     depth_to_cloud,
     register_cloud,
 )
-from slamdepth.geometry import backproject, invert, rotation_angle_rad, se3_exp, transform, umeyama
+from slamdepth.geometry import backproject, invert, rotation_angle_rad, se3_exp, transform
 from slamdepth.types import Camera
 
 CAMERA = Camera(width=160, height=120, fx=130.0, fy=130.0, cx=79.5, cy=59.5)
@@ -101,14 +101,13 @@ def test_depth_of_another_size_is_refused() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_known_motion_is_recovered(seed: int) -> None:
-    """The same points, moved: exact correspondences exist."""
     rng = np.random.default_rng(seed)
     T = se3_exp(rng.uniform(-1, 1, 6) * [0.08, 0.08, 0.08, 0.06, 0.06, 0.06])
     seen = cloud(np.eye(4))
     result = register_cloud(seen, transform(invert(T), seen), np.eye(4))
     moved_m, turned_rad = distance(result.T_world_camera, T)
-    assert moved_m < 0.003
-    assert turned_rad < 0.002
+    assert moved_m < 0.002
+    assert turned_rad < 0.001
     assert result.is_trusted
     assert result.converged
     assert result.fitness > 0.99
@@ -124,8 +123,8 @@ def test_another_view_is_registered_to_the_map() -> None:
     result = register_cloud(local_map, cloud(T), T_guess)
     assert result.is_trusted
     moved_m, turned_rad = distance(result.T_world_camera, T)
-    assert moved_m < 0.02
-    assert turned_rad < 0.01
+    assert moved_m < 0.002
+    assert turned_rad < 0.001
 
 
 def plane(rng: np.random.Generator, half_m: float, count: int, noise_m: float) -> np.ndarray:
@@ -197,14 +196,17 @@ def path(frames: int) -> np.ndarray:
 
 
 def test_odometry_follows_a_path_through_a_room() -> None:
-    T = path(40)
+    T = path(30)
     odometry = CloudOdometry()
     estimate = np.array([odometry.register(cloud(pose, 2), k / 30) for k, pose in enumerate(T)])
-    np.testing.assert_allclose(estimate[0], np.eye(4), atol=1e-12)
-    _, R, t = umeyama(estimate[:, :3, 3], T[:, :3, 3], with_scale=False)
-    error_m = np.linalg.norm(T[:, :3, 3] - (estimate[:, :3, 3] @ R.T + t), axis=1)
-    assert np.sqrt(np.mean(error_m**2)) < 0.02
-    assert len(odometry.local_map_w) > 1000
+    np.testing.assert_allclose(estimate[0], T[0], atol=1e-12)
+    error_m = np.linalg.norm(T[:, :3, 3] - estimate[:, :3, 3], axis=1)
+    length_m = np.sum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1))
+    assert length_m > 0.7
+    # Point-to-point on thinned clouds: about a voxel, and no growth with the way.
+    assert error_m.max() < 0.06
+    assert error_m[-1] < 0.05
+    assert len(odometry.local_map_w) > 500
 
 
 def test_odometry_is_deterministic() -> None:

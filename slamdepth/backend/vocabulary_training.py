@@ -100,7 +100,7 @@ def read_descriptors(folder: Path, exclude: Sequence[str], features: int) -> lis
 
     if not folder.is_dir():
         raise DatasetError(f"{folder}: no such folder; expected one folder of .jpg images a place")
-    orb = cv2.ORB_create(nfeatures=features, fastThreshold=7)
+    orb = cv2.ORB.create(nfeatures=features, fastThreshold=7)
     found: list[Descriptors] = []
     for path in sorted(folder.glob("*/*.jpg")):
         if path.parent.name in exclude:

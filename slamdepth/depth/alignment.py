@@ -101,7 +101,10 @@ class DepthField:
         """Only the log correction ``(N,)``; cheaper, for dense maps."""
         if self._factor is None:
             return np.full(len(px), self.offset)
-        return self.offset + self._kernel(px, log_predicted, sigma, self._px, self._log, self._sigma) @ self._solved
+        return (
+            self.offset
+            + self._kernel(px, log_predicted, sigma, self._px, self._log, self._sigma) @ self._solved
+        )
 
     def _kernel(self, pa: Floats, la: Floats, sa: Floats, pb: Floats, lb: Floats, sb: Floats) -> Floats:
         s = self._settings
@@ -164,21 +167,24 @@ def fit_depth_field(
         index = np.sort(surest[:: max(1, len(surest) // MAX_ANCHORS)][:MAX_ANCHORS])
     unit_px = width / 640.0
     field = DepthField(
-        px[index], log_predicted[index], sigma[index], np.zeros(len(index)), None, prior_offset, unit_px, settings
+        px[index],
+        log_predicted[index],
+        sigma[index],
+        np.zeros(len(index)),
+        None,
+        prior_offset,
+        unit_px,
+        settings,
     )
     if len(index) == 0:
         return field
     from scipy.linalg import cho_factor, cho_solve
 
-    K = field._kernel(
-        field._px, field._log, field._sigma, field._px, field._log, field._sigma
-    )
+    K = field._kernel(field._px, field._log, field._sigma, field._px, field._log, field._sigma)
     noise = sigma_map[index] ** 2 + settings.white_share * sigma[index] ** 2 + 1e-4
     factor = cho_factor(K + np.diag(noise), lower=True, check_finite=False)
     solved = cho_solve(factor, ratio[index] - prior_offset, check_finite=False)
-    return DepthField(
-        field._px, field._log, field._sigma, solved, factor, prior_offset, unit_px, settings
-    )
+    return DepthField(field._px, field._log, field._sigma, solved, factor, prior_offset, unit_px, settings)
 
 
 def sample(values: Floats, px: Floats) -> Floats:

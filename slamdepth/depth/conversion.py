@@ -110,9 +110,7 @@ def _renamed(initialisers: Tensors, matmuls: dict[str, str], origin: str) -> Ten
     return {name: np.ascontiguousarray(value) for name, value in out.items()}
 
 
-def _only(
-    initialisers: Tensors, shape: tuple[int, ...], prefix: str, origin: str
-) -> NDArray[np.float32]:
+def _only(initialisers: Tensors, shape: tuple[int, ...], prefix: str, origin: str) -> NDArray[np.float32]:
     matches = [v for n, v in initialisers.items() if v.shape == shape and n.startswith(prefix)]
     if len(matches) != 1:
         raise WeightsError(

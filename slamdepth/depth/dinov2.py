@@ -128,7 +128,12 @@ class DinoV2(nn.Module):
         Raises:
             ValueError: the image does not fit the patch size, or a tap does not exist.
         """
-        if image.ndim != 4 or image.shape[1] != 3 or image.shape[2] % self.patch or image.shape[3] % self.patch:
+        if (
+            image.ndim != 4
+            or image.shape[1] != 3
+            or image.shape[2] % self.patch
+            or image.shape[3] % self.patch
+        ):
             raise ValueError(
                 f"the image must be (B, 3, H, W) with H and W multiples of {self.patch}, got {tuple(image.shape)}"
             )

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from slamdepth.depth.layout import check_layout
+from slamdepth.depth.layout import check_layout, pack_about, unpack_about
 from slamdepth.errors import WeightsError
 
 _FACTOR = 7
@@ -109,9 +109,7 @@ def convex_upsample(coarse: Tensor, logits: Tensor) -> Tensor:
     padded = F.pad(coarse, (1, 1, 1, 1), mode="replicate")
     neighbours = F.unfold(padded, 3).reshape(batch, channels, 9, 1, rows * columns)
     fine = (weights * neighbours).sum(dim=2)
-    return F.pixel_shuffle(
-        fine.reshape(batch, channels * _FACTOR * _FACTOR, rows, columns), _FACTOR
-    )
+    return F.pixel_shuffle(fine.reshape(batch, channels * _FACTOR * _FACTOR, rows, columns), _FACTOR)
 
 
 class HeadEnsemble(nn.Module):
@@ -150,7 +148,7 @@ def save_head(path: Path, model: HeadEnsemble, about: dict[str, str]) -> None:
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(save(tensors, metadata=dict(sorted(meta.items()))))
+    partial.write_bytes(save(tensors, metadata=pack_about(meta)))
     partial.replace(path)
 
 
@@ -167,7 +165,7 @@ def load_head(path: Path, device: str = "cpu") -> tuple[HeadEnsemble, dict[str, 
         raise WeightsError(f"{path}: no such depth head")
     try:
         with safe_open(str(path), framework="pt") as file:
-            meta = dict(file.metadata() or {})
+            meta = unpack_about(file.metadata())
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file: {error}") from error

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names and shapes a weights file must have, and the strict check of them."""
+"""Names and shapes a weights file must have, the strict check of them, and its header."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 
 from slamdepth.errors import WeightsError
 
 Shape = tuple[int, ...]
 
-VITS14 = {"dim": 384, "depth": 12, "heads": 6, "patch": 14, "grid": 37}
+_HEADER_KEY = "slamdepth"
 
 
 def dinov2_layout(dim: int = 384, depth: int = 12, patch: int = 14, grid: int = 37) -> dict[str, Shape]:
@@ -74,3 +75,18 @@ def check_layout(
         )
     if problems:
         raise WeightsError(f"{origin}: not the layout this network needs: tensors {'; '.join(problems)}")
+
+
+def pack_about(about: Mapping[str, str]) -> dict[str, str]:
+    """What is to be said of a file as safetensors metadata, under one key: safetensors
+    writes several keys in random order, and the same training must give the same bytes."""
+    return {_HEADER_KEY: json.dumps(dict(about), sort_keys=True)}
+
+
+def unpack_about(metadata: Mapping[str, str] | None) -> dict[str, str]:
+    """What :func:`pack_about` packed; empty for a file of another origin."""
+    try:
+        about = json.loads((metadata or {}).get(_HEADER_KEY, "{}"))
+    except ValueError:
+        return {}
+    return {str(key): str(value) for key, value in about.items()} if isinstance(about, dict) else {}

@@ -64,9 +64,7 @@ class Dinov2Depth:
         backbone_sha256 = store.verify(backbone_file)
         network, about = load_head(head_file, device)
         infos = (
-            WeightsInfo(
-                store.BACKBONE, backbone_sha256, store.BACKBONE_TRAINED_ON, store.BACKBONE_LICENCE
-            ),
+            WeightsInfo(store.BACKBONE, backbone_sha256, store.BACKBONE_TRAINED_ON, store.BACKBONE_LICENCE),
             WeightsInfo(
                 head_file.stem,
                 store.sha256_of(head_file),

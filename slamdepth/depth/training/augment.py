@@ -108,7 +108,9 @@ def photometric(
     s = config.colour
     if s > 0:
         x = x ** np.float32(np.exp(rng.normal(0, 0.5 * s)))
-        x *= np.exp(rng.normal(0, 0.25 * s, 3)).astype(np.float32) * np.float32(np.exp(rng.normal(0, 0.5 * s)))
+        x *= np.exp(rng.normal(0, 0.25 * s, 3)).astype(np.float32) * np.float32(
+            np.exp(rng.normal(0, 0.5 * s))
+        )
         grey = x.mean(axis=2, keepdims=True)
         x = grey + (x - grey) * np.float32(np.exp(rng.normal(0, s)))
         x = x.mean() + (x - x.mean()) * np.float32(np.exp(rng.normal(0, 0.4 * s)))

@@ -77,11 +77,17 @@ class TrainConfig(_Section):
 
     seed: int = Field(0, ge=0)
     members: int = Field(1, ge=1, le=16, description="heads trained from different seeds and averaged")
-    epochs: int = Field(8, ge=1)
+    coarse_epochs: int = Field(10, ge=0, description="epochs judged at 1/7 resolution, before the upsampling")
+    fine_epochs: int = Field(2, ge=0, description="epochs judged at full resolution, after them")
     batch: int = Field(16, ge=1)
-    learning_rate: float = Field(1e-3, gt=0)
+    learning_rate: float = Field(2e-3, gt=0, description="peak; a tenth of it in the fine epochs")
     weight_decay: float = Field(0.05, ge=0)
+    sigma_scale: float = Field(
+        1.0, gt=0, description="calibration of sigma; measured instead where there are held-out places"
+    )
     backbone: str | None = Field(None, description="weights file; the cached one if absent")
+    trained_on: str = Field("", description="said of the head wherever it is used; its places if empty")
+    licence: str = Field("unknown", description="licence of the head")
     output: str = Field(description="file the head is written to")
     data: DataConfig
     head: HeadConfig = HeadConfig()

@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training of a depth head on cached features.
+
+First epochs at 1/7 resolution, where a step costs a fifth, then a few at full resolution
+for the edges. After every epoch a checkpoint is written; a killed training goes on from
+it to the same result, bit for bit.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from slamdepth.depth import weights as store
+from slamdepth.depth.dinov2 import DinoV2, load_dinov2
+from slamdepth.depth.head import DepthHead, HeadEnsemble, HeadShape, save_head
+from slamdepth.depth.preprocess import normalised
+from slamdepth.depth.training.config import TrainConfig, digest
+from slamdepth.depth.training.data import Place, data_folder, open_place
+from slamdepth.depth.training.features import FeatureCache, build_cache, plan_plain, plan_samples
+from slamdepth.depth.training.losses import total_loss
+from slamdepth.errors import ConfigError, OutputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[str, float], None]
+COARSE = 7
+_JUDGED_VIEWS = 50
+_ONE_SIGMA = 0.6827
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a training made.
+
+    Attributes:
+        output: the head file.
+        losses: ``(members, epochs)`` mean training loss.
+        held_out: for each held-out place, the figures of :func:`judge`.
+        sigma_scale: factor on sigma stored in the head.
+    """
+
+    output: Path
+    losses: NDArray[np.float64]
+    held_out: dict[str, dict[str, float]]
+    sigma_scale: float
+
+
+def train_depth(
+    config: TrainConfig,
+    *,
+    device: str = "cpu",
+    progress: Progress | None = None,
+    backbone: DinoV2 | None = None,
+) -> TrainResult:
+    """Train the heads of ``config``, judge them on its held-out places, write the file.
+
+    Args:
+        backbone: use this instead of the weights ``config`` names (for tests).
+
+    Raises:
+        ConfigError: a place is both trained on and held out.
+        DatasetError: a place is missing or malformed.
+        WeightsError: the backbone is missing or damaged.
+        OutputError: the output cannot be written.
+    """
+    tell = progress or (lambda what, share: None)
+    both = {place.name for place in config.data.places} & set(config.data.held_out)
+    if both:
+        raise ConfigError(f"setting 'data.held_out': {sorted(both)[0]} is also trained on")
+    output = Path(config.output)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{output.parent}: cannot be made: {error.strerror}") from error
+    folder = data_folder(config.data.folder)
+    places = [open_place(folder / place.name) for place in config.data.places]
+    judged = [open_place(folder / name) for name in config.data.held_out]
+    backbone_sha256 = "given"
+    if backbone is None:
+        file = store.find_backbone(config.backbone)
+        backbone_sha256 = store.verify(file)
+        backbone = load_dinov2(file, device)
+
+    taps = config.head.taps
+    key = digest(config.data, taps, config.seed, backbone_sha256)
+    root = store.cache_dir() / "features"
+    samples = [place.samples for place in config.data.places]
+    keys = plan_samples(places, samples, config.seed)
+    cache = build_cache(
+        root / key, places, keys, config.data, backbone, taps, config.seed, device=device, progress=progress
+    )
+    shape = HeadShape(
+        taps, backbone.dim, config.head.dim, config.head.blocks, config.head.guide_dim, config.members
+    )
+    ensemble = HeadEnsemble(shape)
+    losses = []
+    for member in range(config.members):
+        head, history = _train_member(config, cache, shape, member, device, tell)
+        ensemble.members[member].load_state_dict(head.state_dict())
+        losses.append(history)
+    ensemble.eval().to(device)
+
+    held_out, ratios = {}, []
+    for index, place in enumerate(judged):
+        where = root / digest(config.data, taps, config.seed, backbone_sha256, "plain", place.name)
+        plain = _plain_cache(where, judged, index, config, backbone, taps, device, progress)
+        held_out[place.name], ratio = judge(ensemble, plain, device)
+        ratios.append(ratio)
+    ensemble.sigma_scale = config.sigma_scale
+    if ratios:
+        # Each place counts the same: the mean over places of the ratio that covers 68 %.
+        ensemble.sigma_scale = float(np.mean([np.quantile(ratio, _ONE_SIGMA) for ratio in ratios]))
+    names = ", ".join(place.name for place in places)
+    about = {
+        "trained_on": config.trained_on or names,
+        "licence": config.licence,
+        "seed": str(config.seed),
+        "settings": json.dumps(config.model_dump(mode="json"), sort_keys=True),
+        "backbone_sha256": backbone_sha256,
+    }
+    try:
+        save_head(output, ensemble, about)
+        for member in range(config.members):
+            _checkpoint_path(config, member).unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be written: {error.strerror}") from error
+    return TrainResult(output, np.array(losses), held_out, ensemble.sigma_scale)
+
+
+def judge(
+    ensemble: HeadEnsemble, cache: FeatureCache, device: str
+) -> tuple[dict[str, float], NDArray[np.float64]]:
+    """Figures over the samples of ``cache``, and all ``|log error| / sigma``.
+
+    AbsRel as predicted and after a median per view, delta1 after it, the spread of the
+    views' log scales, and the share of errors below one sigma.
+    """
+    rows: list[list[float]] = []
+    ratios = []
+    for k in range(len(cache)):
+        batch = _batch(cache, np.array([k]), device)
+        with torch.inference_mode():
+            log_depth, sigma = ensemble(*batch[:3])
+        known = batch[3][0] > 0
+        if int(known.sum()) < 100:
+            continue
+        error = (log_depth[0][known] - batch[3][0][known].log()).double().cpu().numpy()
+        ratios.append(np.abs(error) / sigma[0][known].double().cpu().numpy())
+        median = float(np.median(error))
+        scaled = np.exp(error - median)
+        rows.append([
+            float(np.mean(np.abs(np.exp(error) - 1))),
+            float(np.mean(np.abs(scaled - 1))),
+            float(np.mean(np.maximum(scaled, 1 / scaled) < 1.25)),
+            median,
+        ])  # fmt: skip
+    if not rows:
+        return {}, np.ones(1)
+    table = np.array(rows)
+    ratio = np.concatenate(ratios)
+    return {
+        "abs_rel": float(table[:, 0].mean()),
+        "abs_rel_frame_median": float(table[:, 1].mean()),
+        "delta1_frame_median": float(table[:, 2].mean()),
+        "scale_spread": float(table[:, 3].std()),
+        "within_one_sigma": float(np.mean(ratio < 1)),
+    }, ratio
+
+
+def _plain_cache(
+    where: Path,
+    places: list[Place],
+    index: int,
+    config: TrainConfig,
+    backbone: DinoV2,
+    taps: tuple[int, ...],
+    device: str,
+    progress: Progress | None,
+) -> FeatureCache:
+    keys = plan_plain(index, places[index], _JUDGED_VIEWS)
+    return build_cache(
+        where, places, keys, config.data, backbone, taps, config.seed, device=device, progress=progress
+    )
+
+
+def _train_member(
+    config: TrainConfig, cache: FeatureCache, shape: HeadShape, member: int, device: str, tell: Progress
+) -> tuple[DepthHead, list[float]]:
+    seed = config.seed * 1000 + member
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        head = DepthHead(shape, config.head.dropout).to(device)
+        optimiser = torch.optim.AdamW(
+            head.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+        path, key = _checkpoint_path(config, member), digest(config, member, len(cache))
+        history: list[float] = []
+        if path.is_file():
+            state = torch.load(path, map_location=device, weights_only=True)
+            if state["key"] == key:
+                head.load_state_dict(state["head"])
+                optimiser.load_state_dict(state["optimiser"])
+                history = list(state["history"])
+                logger.info("going on from epoch %d of %s", len(history), path)
+        epochs = config.coarse_epochs + config.fine_epochs
+        for epoch in range(len(history), epochs):
+            torch.manual_seed(seed + 1_000_003 * (epoch + 1))  # so that a resumed epoch drops the same
+            history.append(_epoch(config, cache, head, optimiser, epoch, seed, device))
+            partial = path.with_name(path.name + ".partial")
+            torch.save(
+                {"key": key, "head": head.state_dict(), "optimiser": optimiser.state_dict(),
+                 "history": history},
+                partial,
+            )  # fmt: skip
+            os.replace(partial, path)
+            logger.info("member %d epoch %d: loss %.4f", member, epoch, history[-1])
+            tell(f"member {member + 1}: loss {history[-1]:.4f}", (epoch + 1) / epochs)
+    return head.eval(), history
+
+
+def _epoch(
+    config: TrainConfig,
+    cache: FeatureCache,
+    head: DepthHead,
+    optimiser: torch.optim.Optimizer,
+    epoch: int,
+    seed: int,
+    device: str,
+) -> float:
+    head.train()
+    order = np.random.default_rng([seed, epoch]).permutation(len(cache))
+    steps = max(1, len(cache) // config.batch)
+    is_fine = epoch >= config.coarse_epochs
+    total = 0.0
+    for step in range(steps):
+        chosen = order[step * config.batch : (step + 1) * config.batch]
+        tokens, class_tokens, image, target = _batch(cache, np.sort(chosen), device)
+        if is_fine:
+            prediction = head(tokens, class_tokens, image)
+        else:
+            prediction = head.coarse(tokens, class_tokens, image)[0]
+            target = coarse_target(target)
+        loss = total_loss(prediction, target, config.loss)
+        for group in optimiser.param_groups:
+            group["lr"] = learning_rate(config, epoch + step / steps)
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(head.parameters(), 1.0)
+        optimiser.step()
+        total += float(loss.detach())
+    return total / steps
+
+
+def learning_rate(config: TrainConfig, epoch: float) -> float:
+    """The rate ``epoch`` (with its fraction) into a training: a warm-up, then half a cosine
+    to nothing over the coarse epochs, and another from a tenth over the fine ones."""
+    if epoch < config.coarse_epochs:
+        share = epoch / config.coarse_epochs
+        return config.learning_rate * min(1.0, 0.04 + share / 0.08) * 0.5 * (1 + math.cos(math.pi * share))
+    share = (epoch - config.coarse_epochs) / max(1, config.fine_epochs)
+    return 0.1 * config.learning_rate * 0.5 * (1 + math.cos(math.pi * min(share, 1.0)))
+
+
+def coarse_target(target: Tensor) -> Tensor:
+    """Median of the known depths of each 7 x 7 block of ``(B, H, W)``; 0 where there are none."""
+    batch, rows, columns = target.shape
+    blocks = target.reshape(batch, rows // COARSE, COARSE, columns // COARSE, COARSE)
+    blocks = blocks.permute(0, 1, 3, 2, 4).flatten(3)
+    known = torch.where(blocks > 0, blocks, torch.nan)
+    return known.nanmedian(dim=-1).values.nan_to_num(0.0)
+
+
+def _batch(
+    cache: FeatureCache, chosen: NDArray[np.int64], device: str
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    return (
+        torch.from_numpy(cache.tokens[chosen]).to(device).float(),
+        torch.from_numpy(cache.class_tokens[chosen]).to(device).float(),
+        normalised(cache.image_rgb[chosen], device),
+        torch.from_numpy(cache.canonical_m[chosen]).to(device).float(),
+    )
+
+
+def _checkpoint_path(config: TrainConfig, member: int) -> Path:
+    output = Path(config.output)
+    return output.with_name(f"{output.name}.member{member}.checkpoint")

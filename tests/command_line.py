@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calling the command line from tests, and sequences with something wrong about them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120", "NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
+
+
+def slamdepth(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run ``slamdepth`` in a process of its own."""
+    return subprocess.run(
+        command(*arguments), capture_output=True, text=True, env={**ENVIRONMENT, **environment}, check=False
+    )
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "slamdepth", *map(str, arguments)]
+
+
+def copy_of(sequence: Path, folder: Path) -> Path:
+    """A copy of a TUM folder whose images are links."""
+    for path in sequence.rglob("*"):
+        target = folder / path.relative_to(sequence)
+        if path.is_dir():
+            target.mkdir(parents=True, exist_ok=True)
+        elif path.suffix == ".png":
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.symlink_to(path)
+        else:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, target)
+    return folder
+
+
+def images(sequence: Path) -> list[Path]:
+    return sorted((sequence / "rgb").iterdir())
+
+
+def replace_image(path: Path, data: bytes) -> None:
+    path.unlink()
+    path.write_bytes(data)
+
+
+def make_long(sequence: Path, folder: Path, repeats: int) -> Path:
+    """The sequence played forth and back: long enough to be interrupted whatever the machine."""
+    copy_of(sequence, folder)
+    (folder / "groundtruth.txt").unlink()
+    for kind in ("rgb", "depth"):
+        names = [path.name for path in sorted((folder / kind).iterdir())]
+        there_and_back = names + names[-2:0:-1]
+        lines = [f"{i / 30:.6f} {kind}/{name}" for i, name in enumerate(there_and_back * repeats)]
+        (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
+    return folder
