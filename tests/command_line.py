@@ -3,13 +3,35 @@
 
 from __future__ import annotations
 
+import io
+import logging
 import os
 import shutil
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import NamedTuple
 
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120", "NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
+import pytest
+
+from slamdepth.cli import main
+
+ENVIRONMENT = {
+    **os.environ,
+    "OMP_NUM_THREADS": "1",
+    "COLUMNS": "120",
+    "NO_COLOR": "1",
+    "PYTHONUNBUFFERED": "1",
+}
+
+
+class Finished(NamedTuple):
+    """What a command left behind."""
+
+    returncode: int
+    stdout: str
+    stderr: str
 
 
 def slamdepth(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -17,6 +39,22 @@ def slamdepth(*arguments: object, **environment: str) -> subprocess.CompletedPro
     return subprocess.run(
         command(*arguments), capture_output=True, text=True, env={**ENVIRONMENT, **environment}, check=False
     )
+
+
+def call(*arguments: object) -> Finished:
+    """Run ``slamdepth`` in this process, which spares its start; the environment is this one's."""
+    package = logging.getLogger("slamdepth")
+    before = sys.argv, dict(os.environ), package.level, list(package.handlers)
+    stdout, stderr = io.StringIO(), io.StringIO()
+    sys.argv = ["slamdepth", *map(str, arguments)]
+    try:
+        with redirect_stdout(stdout), redirect_stderr(stderr), pytest.raises(SystemExit) as leaving:
+            main()
+    finally:
+        sys.argv, environment, package.level, package.handlers = before
+        os.environ.clear()
+        os.environ.update(environment)
+    return Finished(int(leaving.value.code or 0), stdout.getvalue(), stderr.getvalue())
 
 
 def command(*arguments: object) -> list[str]:

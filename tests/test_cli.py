@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,13 @@ COMMANDS = ("run", "synth", "evaluate", "train-depth", "eval-depth", "weights li
 
 
 @pytest.fixture(scope="module")
-def run_folder(tiny_room: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def run_folder(tiny_room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run, with its output in ``stdout.txt``."""
     folder = tmp_path_factory.mktemp("cli") / "run"
     done = slamdepth("run", tiny_room, "--depth", "sensor", "--output", folder, "--voxel-size", 0.04)
     assert done.returncode == 0, done.stderr
     (folder / "stdout.txt").write_text(done.stdout)
-    yield folder
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +44,11 @@ def test_the_version() -> None:
 
 
 def test_a_run_writes_everything_it_promises(run_folder: Path) -> None:
-    promised = "trajectory_online.txt trajectory.txt keyframes.txt mesh.ply report.json report.html config.yaml log.txt"
-    assert {path.name for path in run_folder.iterdir()} == {*promised.split(), "README.txt", "stdout.txt"}
+    promised = (
+        "trajectory_online.txt trajectory.txt keyframes.txt mesh.ply report.json report.html config.yaml "
+        "log.txt README.txt"
+    )
+    assert {path.name for path in run_folder.iterdir()} == {*promised.split(), "stdout.txt"}
     online, _ = read_tum_trajectory(run_folder / "trajectory_online.txt")
     final, _ = read_tum_trajectory(run_folder / "trajectory.txt")
     keyframes, _ = read_tum_trajectory(run_folder / "keyframes.txt")
@@ -76,7 +78,17 @@ def test_the_report_has_the_promised_keys(report: dict[str, Any]) -> None:
 
 def test_the_table_says_what_came_out_and_where(run_folder: Path, report: dict[str, Any]) -> None:
     shown = (run_folder / "stdout.txt").read_text()
-    for row in ("frames", "tracked", "frames per second", "keyframes", "loop closures", "scale", "ATE", "RPE", "mesh"):
+    for row in (
+        "frames",
+        "tracked",
+        "frames per second",
+        "keyframes",
+        "loop closures",
+        "scale",
+        "ATE",
+        "RPE",
+        "mesh",
+    ):
         assert row in shown
     assert f"{report['ate']['se3']['rmse_m']:.4f} m" in shown
     flat = shown.replace("\n", "").replace(" ", "")
@@ -101,7 +113,9 @@ def test_evaluate_gives_the_figures_of_the_report(
     run_folder: Path, report: dict[str, Any], tiny_room: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "score.json"
-    done = slamdepth("evaluate", tiny_room / "groundtruth.txt", run_folder / "trajectory.txt", "--output", out)
+    done = slamdepth(
+        "evaluate", tiny_room / "groundtruth.txt", run_folder / "trajectory.txt", "--output", out
+    )
     assert done.returncode == 0, done.stderr
     score = json.loads(out.read_text())
     for kind in ("se3", "sim3"):
@@ -112,7 +126,17 @@ def test_evaluate_gives_the_figures_of_the_report(
 def test_stride_limit_and_no_mesh(tiny_room: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     done = slamdepth(
-        "run", tiny_room, "--depth", "sensor", "--output", folder, "--stride", 2, "--max-frames", 6, "--no-mesh"
+        "run",
+        tiny_room,
+        "--depth",
+        "sensor",
+        "--output",
+        folder,
+        "--stride",
+        2,
+        "--max-frames",
+        6,
+        "--no-mesh",
     )
     assert done.returncode == 0, done.stderr
     assert not (folder / "mesh.ply").exists()
@@ -173,7 +197,18 @@ def test_an_earlier_run_is_kept_unless_told(run_folder: Path, tiny_room: Path) -
 
 def test_synth_then_read(tmp_path: Path) -> None:
     done = slamdepth(
-        "synth", tmp_path / "room", "--frames", 2, "--width", 64, "--height", 48, "--seed", 4, "--texture", "low"
+        "synth",
+        tmp_path / "room",
+        "--frames",
+        2,
+        "--width",
+        64,
+        "--height",
+        48,
+        "--seed",
+        4,
+        "--texture",
+        "low",
     )
     assert done.returncode == 0, done.stderr
     assert len(images(tmp_path / "room")) == 2

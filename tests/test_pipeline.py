@@ -128,14 +128,13 @@ def test_frames_come_in_order_and_with_their_errors() -> None:
     ]
 
 
-def test_frames_without_depth_come_with_unknown_depth(caplog: pytest.LogCaptureFixture) -> None:
+def test_depth_that_does_not_decode_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
     dataset = MadeUpDataset(3, broken_depth=(1,))
     dataset.without_depth = (2,)
     with caplog.at_level(logging.WARNING), FramePrefetcher(dataset, range(3), with_depth=True) as reader:
         frames = [item for item in reader if isinstance(item, Frame)]
-        assert reader.frames_without_depth == 2
-    depths = [frame.depth_m for frame in frames]
-    assert [float(depth.max()) for depth in depths if depth is not None] == [1.0, 0.0, 0.0]
+        assert reader.broken_depth_images == 1
+    assert [frame.depth_m is not None for frame in frames] == [True, False, False]
     assert "depth of frame 1 left out" in caplog.text
 
 
@@ -176,7 +175,9 @@ def test_every_placed_frame_is_in_the_online_trajectory(tmp_path: Path) -> None:
 
 def test_the_online_trajectory_grows_while_the_run_goes_on(tmp_path: Path) -> None:
     lines: list[int] = []
-    tracker = MadeUpTracker(on_step=lambda frame: lines.append(len((tmp_path / "online.txt").read_text().splitlines())))
+    tracker = MadeUpTracker(
+        on_step=lambda frame: lines.append(len((tmp_path / "online.txt").read_text().splitlines()))
+    )
     tracked_of(MadeUpDataset(5), tracker, tmp_path)
     assert lines == [1, 2, 3, 4, 5]  # a heading, and a line for each frame before
 

@@ -190,22 +190,23 @@ def test_unsound_clouds_are_refused() -> None:
 
 
 def path(frames: int) -> np.ndarray:
+    """A curve of about 0.7 m, from rest to rest: slow motion is what plain KISS-ICP drags behind."""
     a = np.linspace(0.0, 1.0, frames)
+    a = a * a * (3 - 2 * a)
     T = np.stack([0.5 * np.sin(2 * a), -0.1 * a, 0.4 * a, 0.1 * np.sin(3 * a), 0.5 * a, 0.05 * a], axis=1)
     return se3_exp(T)
 
 
-def test_odometry_follows_a_path_through_a_room() -> None:
-    T = path(30)
+@pytest.mark.parametrize("frames", [25, 60])
+def test_odometry_follows_a_path_through_a_room(frames: int) -> None:
+    T = path(frames)
     odometry = CloudOdometry()
     estimate = np.array([odometry.register(cloud(pose, 2), k / 30) for k, pose in enumerate(T)])
     np.testing.assert_allclose(estimate[0], T[0], atol=1e-12)
-    error_m = np.linalg.norm(T[:, :3, 3] - estimate[:, :3, 3], axis=1)
-    length_m = np.sum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1))
-    assert length_m > 0.7
-    # Point-to-point on thinned clouds: about a voxel, and no growth with the way.
-    assert error_m.max() < 0.06
-    assert error_m[-1] < 0.05
+    for found, true in zip(estimate, T, strict=True):
+        moved_m, turned_rad = distance(found, true)
+        assert moved_m < 0.006
+        assert turned_rad < 0.004
     assert len(odometry.local_map_w) > 500
 
 

@@ -164,8 +164,13 @@ class _Solver:
         has = np.isfinite(problem.log_depth[index])
         self.log_depth = np.where(has, problem.log_depth[index], 0.0)
         self.inv_sigma_log = np.where(has, 1.0 / np.where(has, problem.sigma_log[index], 1.0), 0.0)
-        free = np.flatnonzero(~problem.fixed)
+        # a fixed pose still has a depth scale of its own to be found
+        scaled = np.zeros(len(problem.fixed), dtype=bool)
+        if problem.sigma_scale > 0:
+            scaled[self.cam[has]] = True
+        free = np.flatnonzero(~problem.fixed | scaled)
         self.free = free
+        self.pinned = problem.fixed[free]
         slot = np.full(len(problem.fixed), -1)
         slot[free] = np.arange(len(free))
         self.slot = slot[self.cam]
@@ -257,12 +262,14 @@ class _Solver:
         Jc[:, :, 5] = Am[:, :, 1] * x - Am[:, :, 0] * y
         if self.problem.sigma_scale > 0:
             Jc[:, 2, 6] = -depth_gain[m]
+        Jc[self.pinned[self.slot[m]], :, :6] = 0.0
         JcT = np.swapaxes(Jc, 1, 2)
         Hcc = np.zeros((self.K, _CAM, _CAM))
         bc = np.zeros((self.K, _CAM))
         if len(m):
             Hcc[self.cam_ids] = np.add.reduceat(JcT @ Jc, self.cam_starts)
             bc[self.cam_ids] = np.add.reduceat((JcT @ b[m][:, :, None])[:, :, 0], self.cam_starts)
+        Hcc[np.flatnonzero(self.pinned)[:, None], np.arange(6), np.arange(6)] += 1.0
         if self.problem.sigma_scale > 0:
             Hcc[:, 6, 6] += 1.0 / self.problem.sigma_scale**2
             bc[:, 6] += state.a[self.free] / self.problem.sigma_scale**2

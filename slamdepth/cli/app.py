@@ -20,9 +20,7 @@ from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_
 from slamdepth.errors import SlamdepthError
 
 # typer carries its own copy of click since 0.26 and uses click before: the name is found, not imported.
-_UsageProblem: type[Any] = next(
-    cls for cls in typer.BadParameter.__mro__ if cls.__name__ == "ClickException"
-)
+_UsageProblem: type[Any] = next(cls for cls in typer.BadParameter.__mro__ if cls.__name__ == "ClickException")
 
 app = typer.Typer(
     name="slamdepth",

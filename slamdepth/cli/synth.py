@@ -11,7 +11,6 @@ import typer
 from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
 
 
-
 def synth_command(
     output: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the sequence.")],
     frames: Annotated[int | None, typer.Option(metavar="N", help="Frames. Default: 300")] = None,

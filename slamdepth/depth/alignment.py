@@ -122,16 +122,30 @@ def log_depth_of(prediction: DepthPrediction) -> tuple[Floats, Floats]:
         TrackingError: the prediction is not metric. Relative depth has to be made metric
             against known points first; taking disparity for depth is never right.
     """
+    sigma = prediction.sigma_log
+    shape = prediction.values.shape
+    return _log_metric(prediction, prediction.values), (
+        np.full(shape, DEFAULT_SIGMA_LOG) if sigma is None else sigma.astype(np.float64)
+    )
+
+
+def log_depth_at(prediction: DepthPrediction, px: Floats) -> tuple[Floats, Floats]:
+    """:func:`log_depth_of` at the nearest of raw pixels ``(N, 2)``, ``(N,)`` each; same errors."""
+    u = np.clip(np.rint(px[:, 0]).astype(np.int64), 0, prediction.values.shape[1] - 1)
+    v = np.clip(np.rint(px[:, 1]).astype(np.int64), 0, prediction.values.shape[0] - 1)
+    sigma = prediction.sigma_log
+    return _log_metric(prediction, prediction.values[v, u]), (
+        np.full(len(px), DEFAULT_SIGMA_LOG) if sigma is None else sigma[v, u].astype(np.float64)
+    )
+
+
+def _log_metric(prediction: DepthPrediction, values: NDArray[np.float32]) -> Floats:
     if prediction.kind is not DepthKind.METRIC:
         raise TrackingError(
             f"a {prediction.kind.value} map cannot be read as metres; use a metric depth model"
         )
-    values = prediction.values
     known = np.isfinite(values) & (values > 0)
-    log = np.full(values.shape, np.nan)
-    log[known] = np.log(values[known])
-    sigma = prediction.sigma_log
-    return log, np.full(values.shape, DEFAULT_SIGMA_LOG) if sigma is None else sigma.astype(np.float64)
+    return np.where(known, np.log(np.where(known, values, 1.0), dtype=np.float64), np.nan)
 
 
 def fit_depth_field(
@@ -185,13 +199,6 @@ def fit_depth_field(
     factor = cho_factor(K + np.diag(noise), lower=True, check_finite=False)
     solved = cho_solve(factor, ratio[index] - prior_offset, check_finite=False)
     return DepthField(field._px, field._log, field._sigma, solved, factor, prior_offset, unit_px, settings)
-
-
-def sample(values: Floats, px: Floats) -> Floats:
-    """Nearest values of an ``(H, W)`` map at raw pixels ``(N, 2)``."""
-    u = np.clip(np.rint(px[:, 0]).astype(np.int64), 0, values.shape[1] - 1)
-    v = np.clip(np.rint(px[:, 1]).astype(np.int64), 0, values.shape[0] - 1)
-    return values[v, u]
 
 
 def apply_field(field: DepthField, prediction: DepthPrediction, step_px: int = 8) -> NDArray[np.float32]:

@@ -135,7 +135,8 @@ class DinoV2(nn.Module):
             or image.shape[3] % self.patch
         ):
             raise ValueError(
-                f"the image must be (B, 3, H, W) with H and W multiples of {self.patch}, got {tuple(image.shape)}"
+                f"the image must be (B, 3, H, W) with H and W multiples of {self.patch}, "
+                f"got {tuple(image.shape)}"
             )
         if not taps or min(taps) < 0 or max(taps) >= len(self.blocks):
             raise ValueError(f"taps {list(taps)} are not blocks 0 to {len(self.blocks) - 1}")

@@ -75,8 +75,7 @@ class DepthHead(nn.Module):
         self.out = nn.Conv2d(shape.guide_dim, 2, 1)
         self.weights = nn.Conv2d(shape.guide_dim, 9 * _FACTOR * _FACTOR, 1)
         nn.init.normal_(self.out.weight, std=1e-3)
-        with torch.no_grad():
-            self.out.bias.copy_(torch.tensor([math.log(1.8), math.log(0.3)]))
+        self.out.bias = nn.Parameter(torch.tensor([math.log(1.8), math.log(0.3)]))
 
     def coarse(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
         """Log depth and log spread ``(B, 2, H/7, W/7)``, and what the upsampling needs."""

@@ -45,10 +45,9 @@ def resize_rgb(image_rgb: NDArray[np.uint8], rows: int, columns: int) -> NDArray
 
     if image_rgb.shape[:2] == (rows, columns):
         return image_rgb
-    shrinks = rows < image_rgb.shape[0]
-    return cv2.resize(
-        image_rgb, (columns, rows), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
-    )
+    interpolation = cv2.INTER_AREA if rows < image_rgb.shape[0] else cv2.INTER_CUBIC
+    resized = cv2.resize(image_rgb, (columns, rows), interpolation=interpolation)
+    return np.asarray(resized, dtype=np.uint8)
 
 
 def normalised(images_rgb: NDArray[np.uint8], device: str) -> torch.Tensor:

@@ -76,8 +76,11 @@ def head_path() -> Path:
 
 def sha256_of(path: Path) -> str:
     """Hex sha256 of a file."""
+    digest = hashlib.sha256()
     with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
 
 
 def list_weights() -> list[WeightsEntry]:

@@ -80,7 +80,9 @@ def create_extractor(config: FeatureConfig) -> FeatureExtractor:
     return factory(config)
 
 
-def spread(px: NDArray[np.float64], response: NDArray[np.float64], count: int, cell_px: float) -> NDArray[np.int64]:
+def spread(
+    px: NDArray[np.float64], response: NDArray[np.float64], count: int, cell_px: float
+) -> NDArray[np.int64]:
     """Choose ``count`` keypoints evenly: every cell's best first, then every cell's second.
 
     Args:

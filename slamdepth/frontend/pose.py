@@ -117,9 +117,7 @@ def refine_pose(
         Pc = points_w @ T[:3, :3].T + T[:3, 3]
         front = Pc[:, 2] > 0.02
         W = np.zeros((n, 2, 2))
-        W[front] = _whitening(
-            pixel_covariance(camera, T, Pc[front], covariance_w[front], sigma_px[front])
-        )
+        W[front] = _whitening(pixel_covariance(camera, T, Pc[front], covariance_w[front], sigma_px[front]))
         for _ in range(iterations):
             use = np.flatnonzero(active & front)
             if len(use) < 4:
@@ -131,7 +129,9 @@ def refine_pose(
             J = Wu @ projection_jacobian(camera, P)
             r = np.einsum("nij,nj->ni", Wu, r)
             norm = np.sqrt(np.einsum("ni,ni->n", r, r))
-            weight = np.where(norm > HUBER, HUBER / np.maximum(norm, 1e-12), 1.0) if robust else np.ones(len(use))
+            weight = (
+                np.where(norm > HUBER, HUBER / np.maximum(norm, 1e-12), 1.0) if robust else np.ones(len(use))
+            )
             Jp = _pose_jacobian(J, P)
             Jw = Jp * weight[:, None, None]
             H = np.einsum("nki,nkj->ij", Jw, Jp)
@@ -203,7 +203,11 @@ def pose_from_scratch(
     params.score = cv2.SCORE_METHOD_MSAC
     params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
     ok, _, rvec, tvec, index = cv2.solvePnPRansac(
-        np.ascontiguousarray(points_w)[:, None], np.ascontiguousarray(px)[:, None], camera.K, None, params=params
+        np.ascontiguousarray(points_w)[:, None],
+        np.ascontiguousarray(px)[:, None],
+        camera.K,
+        None,
+        params=params,
     )
     if not ok or index is None or len(index) < minimum:
         return None

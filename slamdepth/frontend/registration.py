@@ -16,11 +16,11 @@ import numpy as np
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.cloud_odometry import CloudOdometry, CloudOdometryConfig
 from slamdepth.frontend.clouds import checked_cloud, depth_to_cloud
-from slamdepth.geometry import invert, orthonormalised, rotation_angle_rad, so3_exp, transform
+from slamdepth.frontend.point_to_plane import PolishConfig, fit_quality, polish
+from slamdepth.geometry import invert, orthonormalised, rotation_angle_rad, transform
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from scipy.spatial import cKDTree
 
     Array = NDArray[np.float64]
 
@@ -33,10 +33,7 @@ __all__ = [
     "register_cloud",
 ]
 
-# Enough for normals and a verdict; more only cost time.
-_MOST_POINTS = 1500
-_NORMAL_NEIGHBOURS = 20
-_POLISH_ROUNDS = 6
+_POLISH = PolishConfig(rounds=6, points=1500, neighbours=20)
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,7 @@ def register_cloud(
     """Register a cloud to the points of a local map.
 
     KISS-ICP's point-to-point registration from coarse to fine, which has a wide basin, then
-    a few steps of point-to-plane ICP, which is exact where thinned points do not coincide.
+    a few steps of point-to-plane ICP, which does not mind that thinned points never coincide.
 
     Args:
         local_map_w: ``(M, 3)`` points in the world frame, metres.
@@ -122,9 +119,9 @@ def register_cloud(
     pose = _align(map_w, sparse_c, guess, voxel_m=config.search_m, reach_m=config.search_m)
     pose = _align(map_w, sparse_c, pose, voxel_m=voxel_m, reach_m=2.0 * voxel_m)
     tree = cKDTree(map_w)
-    pose, last_step = _polish(tree, cloud_c, pose, config)
-    fitness, rmse_m, observability = _quality(tree, transform(pose, cloud_c), voxel_m)
-    converged = last_step < 0.1 * voxel_m
+    pose, last_step_m = polish(tree, cloud_c, pose, reach_m=voxel_m, config=_POLISH)
+    fitness, rmse_m, observability = fit_quality(tree, transform(pose, cloud_c), voxel_m, _POLISH)
+    converged = last_step_m < 0.1 * voxel_m
     moved_m, turned_rad = _motion(guess, pose)
     is_trusted = (
         converged
@@ -160,94 +157,3 @@ def _motion(T_world_a: Array, T_world_b: Array) -> tuple[float, float]:
     """Distance in metres and angle in radians between two poses."""
     T_a_b = invert(T_world_a) @ T_world_b
     return float(np.linalg.norm(T_a_b[:3, 3])), float(rotation_angle_rad(T_a_b[:3, :3]))
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """Tangent planes of the map beside some points.
-
-    Attributes:
-        middle: ``(N, 3)`` a point of each plane.
-        normal: ``(N, 3)`` unit normals.
-        flatness: ``(N,)`` 1 for a perfect plane, 0 for noise, whose normal says nothing.
-    """
-
-    middle: Array
-    normal: Array
-    flatness: Array
-
-
-def _surface(tree: cKDTree, points_w: Array) -> _Surface:
-    _, beside = tree.query(points_w, k=min(_NORMAL_NEIGHBOURS, tree.n))
-    patches = np.asarray(tree.data)[beside]
-    middle = patches.mean(axis=1)
-    spread = patches - middle[:, None]
-    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))
-    flatness = 1.0 - np.sqrt(np.maximum(variance[:, 0], 0.0) / np.maximum(variance[:, 1], 1e-12))
-    return _Surface(middle, axes[:, :, 0], flatness)
-
-
-def _matched(tree: cKDTree, points_w: Array, reach_m: float) -> tuple[NDArray[np.intp], float]:
-    """Indices of some points that have the map within reach, and the share of all that do."""
-    distance_m, _ = tree.query(points_w, distance_upper_bound=reach_m)
-    matched = np.flatnonzero(np.isfinite(distance_m))
-    return matched[:: 1 + len(matched) // _MOST_POINTS], len(matched) / len(points_w)
-
-
-def _rows(points_w: Array, normals: Array) -> tuple[Array, Array, float]:
-    """Jacobian ``(N, 6)`` of the distances to planes; rotation about the centre, lengths in radii."""
-    centre = points_w.mean(axis=0)
-    arms = points_w - centre
-    radius_m = max(float(np.sqrt(np.mean(np.sum(arms * arms, axis=1)))), 1e-9)
-    return np.concatenate([np.cross(arms / radius_m, normals), normals], axis=1), centre, radius_m
-
-
-def _polish(
-    tree: cKDTree, cloud_c: Array, T_world_camera: Array, config: RegistrationConfig
-) -> tuple[Array, float]:
-    """Point-to-plane Gauss-Newton; returns the pose and the length in metres of the last step.
-
-    Directions that the geometry does not hold are left as they are (Zhang, Kaess and Singh,
-    "On degeneracy of optimization-based state estimation problems", 2016).
-    """
-    pose, step_m = T_world_camera, float("inf")
-    for _ in range(_POLISH_ROUNDS):
-        points = transform(pose, cloud_c)
-        matched, _ = _matched(tree, points, config.voxel_size_m)
-        if len(matched) < config.min_points // 4:
-            return T_world_camera, float("inf")
-        points = points[matched]
-        surface = _surface(tree, points)
-        residual = np.einsum("ni,ni->n", points - surface.middle, surface.normal)
-        weight = surface.flatness / (1.0 + (residual / (0.2 * config.voxel_size_m)) ** 2)
-        rows, centre, radius_m = _rows(points, surface.normal)
-        values, vectors = np.linalg.eigh((rows * weight[:, None]).T @ rows / len(rows))
-        gradient = (rows * weight[:, None]).T @ residual / len(rows)
-        held = 3.0 * values >= config.min_observability * 0.1
-        step = -vectors[:, held] @ ((vectors[:, held].T @ gradient) / values[held])
-        moved = np.eye(4)
-        moved[:3, :3] = so3_exp(step[:3] / radius_m)
-        moved[:3, 3] = centre + step[3:] - moved[:3, :3] @ centre
-        pose = orthonormalised(moved @ pose)
-        step_m = float(np.linalg.norm(step))
-    return pose, step_m
-
-
-def _quality(tree: cKDTree, cloud_w: Array, inlier_m: float) -> tuple[float, float, float]:
-    """Fitness, rmse in metres and observability of a registered cloud.
-
-    Observability is three times the smallest eigenvalue of the mean normal matrix of
-    point-to-plane ICP, rotations taken about the centre and lengths in radii of the cloud
-    (after Gelfand et al., "Geometrically stable sampling for the ICP algorithm", 2003);
-    the matrix of point-to-point ICP does not see that a plane slides along itself.
-    """
-    matched, fitness = _matched(tree, cloud_w, inlier_m)
-    if len(matched) < 6:
-        return fitness, float("inf"), 0.0
-    points = cloud_w[matched]
-    surface = _surface(tree, points)
-    residual = np.einsum("ni,ni->n", points - surface.middle, surface.normal)
-    rows, _, _ = _rows(points, surface.normal)
-    normal_matrix = (rows * surface.flatness[:, None]).T @ rows / len(rows)
-    observability = max(0.0, 3.0 * float(np.linalg.eigvalsh(normal_matrix)[0]))
-    return fitness, float(np.sqrt(np.mean(residual**2))), observability

@@ -8,10 +8,7 @@ import queue
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from types import TracebackType
-
-import numpy as np
 
 from slamdepth.datasets import Dataset
 from slamdepth.errors import ImageDecodeError
@@ -30,8 +27,8 @@ class FramePrefetcher:
     Args:
         dataset: the sequence.
         indices: which frames, in the order they come out.
-        with_depth: also read the sensor depth. A frame whose depth is missing or does not
-            decode comes with depth 0 everywhere, which means unknown.
+        with_depth: also read the sensor depth; None where a frame has none or it does not
+            decode.
         capacity: frames read ahead.
     """
 
@@ -45,7 +42,7 @@ class FramePrefetcher:
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._read_all, name="slamdepth-reader", daemon=True)
         self.read_s = 0.0
-        self.frames_without_depth = 0
+        self.broken_depth_images = 0
 
     def __enter__(self) -> FramePrefetcher:
         self._thread.start()
@@ -87,10 +84,8 @@ class FramePrefetcher:
             frame = self._dataset.read(index, with_depth=True)
         except ImageDecodeError as error:
             frame = self._dataset.read(index)  # raises again where it is the colour image
+            self.broken_depth_images += 1
             logger.warning("depth of frame %d left out: %s", index, error)
-        if frame.depth_m is None:
-            self.frames_without_depth += 1
-            frame = replace(frame, depth_m=np.zeros(frame.image_rgb.shape[:2], np.float32))
         return frame
 
     def _put(self, item: Frame | Exception | None) -> bool:

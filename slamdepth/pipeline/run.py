@@ -20,7 +20,14 @@ from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import DatasetError, InputError, OutputError, SlamdepthError
 from slamdepth.io import write_text, write_tum_trajectory
 from slamdepth.pipeline.folder import FILES, RunFolder, run_log, write_log_to
-from slamdepth.pipeline.options import ProgressCallback, RunInterrupted, RunOptions, RunProgress, RunResult, Stage
+from slamdepth.pipeline.options import (
+    ProgressCallback,
+    RunInterrupted,
+    RunOptions,
+    RunProgress,
+    RunResult,
+    Stage,
+)
 from slamdepth.pipeline.results import (
     judge_depth,
     judge_trajectory,
@@ -79,7 +86,9 @@ def run(
         try:
             write_log_to(log, folder / "log.txt")
             write_text(folder / "config.yaml", _settings_text(options, config))
-            logger.info("%s: %d of %d frames, depth by %s", dataset.path, len(indices), len(dataset), model.name)
+            logger.info(
+                "%s: %d of %d frames, depth by %s", dataset.path, len(indices), len(dataset), model.name
+            )
             tracked = track(
                 dataset,
                 indices,
@@ -100,9 +109,8 @@ def run(
 
 
 def _make_tracker(dataset: Dataset, model: DepthModel, config: Config) -> Any:
-    import slamdepth.tracker as rooms
+    from slamdepth.tracker import create_tracker
 
-    create_tracker = getattr(rooms, "create_tracker", None) or rooms.Tracker  # TEMPORARY
     return create_tracker(dataset.camera, depth_model=model, config=config)
 
 

@@ -99,8 +99,9 @@ def track(
             raise RunInterrupted("interrupted before the first frame; nothing was saved")
         raise DatasetError(f"{dataset.path}: none of the {total} images decodes")
 
-    interrupted = len(steps) + skipped < total
-    progress(replace(_state(steps[-1], len(steps) + skipped, total, len(steps), start_s), stage=Stage.OPTIMISING))
+    done = len(steps) + skipped
+    state = _state(steps[-1], done, total, len(steps), start_s)
+    progress(replace(state, stage=Stage.OPTIMISING))
     finish_s = time.perf_counter()
     reconstruction = tracker.finish()
     end_s = time.perf_counter()
@@ -110,12 +111,12 @@ def track(
         "decode": 1e3 * reader.read_s / max(1, len(steps)),
     }
     notes: list[str] = []
-    if interrupted:
-        notes.append(f"interrupted after {len(steps) + skipped} of {total} frames")
+    if done < total:
+        notes.append(f"interrupted after {done} of {total} frames")
     if skipped:
         notes.append(f"{skipped} of {total} images do not decode and were skipped")
-    if reader.frames_without_depth:
-        notes.append(f"{reader.frames_without_depth} frames have no sensor depth of their time")
+    if reader.broken_depth_images:
+        notes.append(f"{reader.broken_depth_images} depth images do not decode and were left out")
     for note in notes:
         logger.warning("%s", note)
     return Tracked(
@@ -123,7 +124,7 @@ def track(
         tuple(steps),
         len(steps) / (end_s - start_s),
         skipped,
-        interrupted,
+        done < total,
         tuple(notes),
     )
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.config import Config
-from slamdepth.depth.alignment import apply_field, log_depth_of, sample
+from slamdepth.depth.alignment import apply_field, log_depth_at
 from slamdepth.geometry import invert, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.frame_log import FrameLog
@@ -33,7 +33,9 @@ def optimise_everything(
     notes = []
     keyframes = landmarks.keyframes
     if config.bundle.final and 3 <= len(keyframes) <= _MAX_KEYFRAMES:
-        rows = np.flatnonzero(landmarks.alive[: landmarks.size] & (landmarks.observations[: landmarks.size] >= 2))
+        rows = np.flatnonzero(
+            landmarks.alive[: landmarks.size] & (landmarks.observations[: landmarks.size] >= 2)
+        )
         mapper.adjust([k.id for k in keyframes], [], rows, (5, 8))
     elif len(keyframes) > _MAX_KEYFRAMES:
         notes.append(
@@ -77,12 +79,11 @@ def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> str:
 
 def _scale_vote(landmarks: LandmarkMap, keyframe: MapKeyframe) -> float | None:
     assert keyframe.prediction is not None
-    log_map, _ = log_depth_of(keyframe.prediction)
     at = np.flatnonzero(keyframe.point_ids >= 0)
     rows = keyframe.point_ids[at]
     at, rows = at[landmarks.observations[rows] >= 3], rows[landmarks.observations[rows] >= 3]
     z = transform(keyframe.T_camera_world, landmarks.position_w[rows])[:, 2]
-    predicted = sample(log_map, keyframe.features.raw_px[at])
+    predicted, _ = log_depth_at(keyframe.prediction, keyframe.features.raw_px[at])
     ok = (z > 0.05) & np.isfinite(predicted)
     if np.count_nonzero(ok) < 20:
         return None

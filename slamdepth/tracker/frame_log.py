@@ -101,7 +101,9 @@ class FrameLog:
             )
             if np.count_nonzero(estimate.inliers) < 0.5 * len(good):
                 continue
-            distance = float(np.median(np.linalg.norm(landmarks.position_w[rows] - invert(start)[:3, 3], axis=1)))
+            distance = float(
+                np.median(np.linalg.norm(landmarks.position_w[rows] - invert(start)[:3, 3], axis=1))
+            )
             moved = np.linalg.norm(invert(estimate.T_camera_world)[:3, 3] - invert(start)[:3, 3])
             if moved < _MAX_SHIFT_SHARE * distance:
                 placed.T_camera_keyframe = estimate.T_camera_world @ keyframe.T_world_camera

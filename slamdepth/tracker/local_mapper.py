@@ -9,7 +9,7 @@ import numpy as np
 
 from slamdepth.backend.bundle import BundleProblem, BundleResult, bundle_adjust
 from slamdepth.config import Config
-from slamdepth.depth.alignment import DepthField, fit_depth_field, log_depth_of, sample
+from slamdepth.depth.alignment import DepthField, fit_depth_field, log_depth_at
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, invert, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
@@ -57,9 +57,7 @@ class LocalMapper:
 
     def _give_birth(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
         features, config = keyframe.features, self._config.depth
-        log_map, sigma_map_full = log_depth_of(prediction)
-        log = sample(log_map, features.raw_px)
-        sigma = sample(sigma_map_full, features.raw_px)
+        log, sigma = log_depth_at(prediction, features.raw_px)
         if prediction.is_sensor:
             keyframe.log_depth, keyframe.sigma_log = log, sigma
             depth, sigma_birth = log, sigma
@@ -83,14 +81,11 @@ class LocalMapper:
             self._camera, features.px[born], position_c, sigma_birth[born], features.sigma_px[born]
         )
         R = T_world_camera[:3, :3]
-        self._map.add_points(
-            keyframe, born, transform(T_world_camera, position_c), R @ covariance_c @ R.T
-        )
+        self._map.add_points(keyframe, born, transform(T_world_camera, position_c), R @ covariance_c @ R.T)
 
     def depth_field(self, keyframe: MapKeyframe) -> DepthField:
         """The keyframe's prediction tied to the well-known points it sees."""
         assert keyframe.prediction is not None
-        log_map, sigma_full = log_depth_of(keyframe.prediction)
         seen = np.flatnonzero(keyframe.point_ids >= 0)
         rows = keyframe.point_ids[seen]
         multi = self._map.observations[rows] >= 2
@@ -99,10 +94,11 @@ class LocalMapper:
         ok = z > 0.05
         seen, rows, z = seen[ok], rows[ok], z[ok]
         raw = keyframe.features.raw_px[seen]
+        log_predicted, sigma = log_depth_at(keyframe.prediction, raw)
         return fit_depth_field(
             raw,
-            sample(log_map, raw),
-            sample(sigma_full, raw),
+            log_predicted,
+            sigma,
             np.log(z),
             self._map.sigma_along_ray(rows, keyframe.center_w),
             width=self._camera.width,

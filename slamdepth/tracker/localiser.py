@@ -224,7 +224,9 @@ class Localiser:
         point_ids[at[estimate.inliers]] = rows[estimate.inliers]
         return Placement(estimate.T_camera_world, point_ids, estimate.information)
 
-    def from_keyframe(self, features: Features, keyframe_id: int, *, minimum: int | None = None) -> Placement | None:
+    def from_keyframe(
+        self, features: Features, keyframe_id: int, *, minimum: int | None = None
+    ) -> Placement | None:
         """Place a frame by matching it with one keyframe, without knowing where it is."""
         need = self._config.tracking.min_inliers if minimum is None else minimum
         keyframe = self._map.keyframes[keyframe_id]
@@ -234,7 +236,11 @@ class Localiser:
         a, b, _ = match_all(keyframe.features.descriptors[has], features.descriptors, ratio=0.85)
         rows = keyframe.point_ids[has[a]]
         solution = pose_from_scratch(
-            self._camera, self._map.position_w[rows], features.px[b], seed=self._config.seed, minimum=max(8, need // 2)
+            self._camera,
+            self._map.position_w[rows],
+            features.px[b],
+            seed=self._config.seed,
+            minimum=max(8, need // 2),
         )
         if solution is None:
             return None

@@ -145,9 +145,10 @@ class LoopCloser:
         """Move points with the keyframe they were born in, and keyframes to their new poses."""
         landmarks = self._map
         birth = landmarks.birth_keyframe[: landmarks.size]
-        old_c = np.einsum(
-            "nij,nj->ni", invert(T_old)[birth][:, :3, :3], landmarks.position_w[: landmarks.size]
-        ) + invert(T_old)[birth][:, :3, 3]
+        old_c = (
+            np.einsum("nij,nj->ni", invert(T_old)[birth][:, :3, :3], landmarks.position_w[: landmarks.size])
+            + invert(T_old)[birth][:, :3, 3]
+        )
         old_c *= scales[birth][:, None]
         landmarks.position_w[: landmarks.size] = (
             np.einsum("nij,nj->ni", T_new[birth][:, :3, :3], old_c) + T_new[birth][:, :3, 3]

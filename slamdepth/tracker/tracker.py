@@ -112,7 +112,7 @@ class Tracker:
 
         self._frames += 1
         with self._timed("features"):
-            gray = cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)
+            gray = np.asarray(cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
             features = self._extractor.extract(gray, self.camera)
         if not self._map.keyframes:
             return self._start(frame, features)
@@ -203,7 +203,9 @@ class Tracker:
             return None
         log.info("frame %d: too few features match; placed by registration of its depth", frame.index)
         empty = Placement(T, np.full(len(features), -1, dtype=np.int64), np.eye(6))
-        recent = self._map.points_of([k.id for k in self._map.keyframes[-self.config.tracking.local_keyframes :]])
+        recent = self._map.points_of(
+            [k.id for k in self._map.keyframes[-self.config.tracking.local_keyframes :]]
+        )
         return self._localiser.attach(features, empty, recent)
 
     def _can_be_keyframe(self, frame: Frame) -> bool:

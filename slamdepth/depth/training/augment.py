@@ -9,7 +9,7 @@ held-rolled cameras, other focal lengths, other distances, other light.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -89,8 +89,10 @@ def turned_view(
     rays = rays_view @ R_camera_view.T
     pixels = (rays / rays[..., 2:]) @ camera.K.T
     map_x, map_y = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
-    image = cv2.remap(frame.image_rgb, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-    raw = cv2.remap(
+    image: NDArray[Any] = cv2.remap(
+        frame.image_rgb, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+    )
+    raw: NDArray[Any] = cv2.remap(
         frame.depth_m, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
     )
     # A point at z on its old ray lies at z / ray_z on the new optical axis's depth.
@@ -104,7 +106,7 @@ def photometric(
     """Random light, tint, saturation, blur, noise and compression of ``(H, W, 3)`` uint8."""
     import cv2
 
-    x = image_rgb.astype(np.float32) / 255.0
+    x: NDArray[Any] = image_rgb.astype(np.float32) / 255.0
     s = config.colour
     if s > 0:
         x = x ** np.float32(np.exp(rng.normal(0, 0.5 * s)))
@@ -125,7 +127,7 @@ def photometric(
     if rng.random() < config.jpeg:
         quality = int(rng.integers(40, 96))
         _, data = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        out = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        out = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)
     return out
 
 

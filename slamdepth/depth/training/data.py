@@ -7,7 +7,7 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -98,7 +98,7 @@ def open_place(folder: Path) -> Place:
     return Place(folder.name, camera, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), unit)
 
 
-def _decode(path: Path, *, colour: bool) -> NDArray[np.generic]:
+def _decode(path: Path, *, colour: bool) -> NDArray[Any]:
     import cv2
 
     array = cv2.imread(str(path), cv2.IMREAD_COLOR if colour else cv2.IMREAD_UNCHANGED)

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The last millimetres of a registration: point-to-plane ICP, and how well it is held.
+
+Chen and Medioni, "Object modelling by registration of multiple range images", 1992.
+Point-to-point ICP between thinned clouds pulls a slowly moving camera back to where it was
+(each point of a wall finds a neighbour on the wall nearby); distances to planes do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.geometry import orthonormalised, so3_exp, transform
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from scipy.spatial import cKDTree
+
+    Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PolishConfig:
+    """What point-to-plane ICP may cost.
+
+    Attributes:
+        rounds: Gauss-Newton steps, correspondences found anew for each.
+        points: about so many points of the cloud are used; more only cost time.
+        neighbours: map points that make a tangent plane.
+        min_points: with fewer correspondences the pose is left as it is.
+        min_held: a direction whose observability (see :func:`fit_quality`) is less is left as it is.
+    """
+
+    rounds: int = 3
+    points: int = 600
+    neighbours: int = 12
+    min_points: int = 50
+    min_held: float = 0.005
+
+
+def polish(
+    tree: cKDTree, cloud_c: Array, T_world_camera: Array, *, reach_m: float, config: PolishConfig
+) -> tuple[Array, float]:
+    """Move a nearly registered cloud onto the tangent planes of a map.
+
+    Directions that the geometry does not hold are not moved along (Zhang, Kaess and Singh,
+    "On degeneracy of optimization-based state estimation problems", 2016).
+
+    Args:
+        tree: over the map's points in the world frame, metres.
+        cloud_c: ``(N, 3)`` points in the camera frame, metres.
+        T_world_camera: ``(4, 4)``, right to within ``reach_m``.
+
+    Returns:
+        The pose and the length of the last step in metres; the pose as it was and infinity
+        where too few points have the map within reach.
+    """
+    pose, step_m = T_world_camera, float("inf")
+    for _ in range(config.rounds):
+        points, _ = _matched(tree, transform(pose, cloud_c), reach_m, config)
+        if len(points) < config.min_points:
+            return T_world_camera, float("inf")
+        surface = _surface(tree, points, config)
+        weight = surface.flatness / (1.0 + (surface.distance_m / (0.2 * reach_m)) ** 2)
+        rows, centre, radius_m = _rows(points, surface.normal)
+        weighted = rows * weight[:, None] / len(rows)
+        values, vectors = np.linalg.eigh(weighted.T @ rows)
+        held = 3.0 * values >= config.min_held
+        gradient = vectors[:, held].T @ (weighted.T @ surface.distance_m)
+        step = -vectors[:, held] @ (gradient / values[held])
+        moved = np.eye(4)
+        moved[:3, :3] = so3_exp(step[:3] / radius_m)
+        moved[:3, 3] = centre + step[3:] - moved[:3, :3] @ centre
+        pose = orthonormalised(moved @ pose)
+        step_m = float(np.linalg.norm(step))
+    return pose, step_m
+
+
+def fit_quality(
+    tree: cKDTree, cloud_w: Array, inlier_m: float, config: PolishConfig
+) -> tuple[float, float, float]:
+    """Fitness, rmse in metres and observability of a registered cloud ``(N, 3)`` of the world frame.
+
+    Fitness is the share of points with a map point within ``inlier_m``, rmse their distance
+    to the map's tangent planes. Observability is three times the smallest eigenvalue of the
+    mean normal matrix of point-to-plane ICP, rotations taken about the centre and lengths in
+    radii of the cloud (after Gelfand et al., "Geometrically stable sampling for the ICP
+    algorithm", 2003); the matrix of point-to-point ICP does not see that a plane slides
+    along itself.
+    """
+    points, fitness = _matched(tree, cloud_w, inlier_m, config)
+    if len(points) < 6:
+        return fitness, float("inf"), 0.0
+    surface = _surface(tree, points, config)
+    rows, _, _ = _rows(points, surface.normal)
+    normal_matrix = (rows * surface.flatness[:, None]).T @ rows / len(rows)
+    observability = max(0.0, 3.0 * float(np.linalg.eigvalsh(normal_matrix)[0]))
+    return fitness, float(np.sqrt(np.mean(surface.distance_m**2))), observability
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """Tangent planes of the map beside some points.
+
+    Attributes:
+        normal: ``(N, 3)`` unit normals.
+        distance_m: ``(N,)`` signed distances of the points from their planes.
+        flatness: ``(N,)`` 1 for a perfect plane, 0 for noise, whose normal says nothing.
+    """
+
+    normal: Array
+    distance_m: Array
+    flatness: Array
+
+
+def _surface(tree: cKDTree, points_w: Array, config: PolishConfig) -> _Surface:
+    _, beside = tree.query(points_w, k=min(config.neighbours, tree.n))
+    patches = np.asarray(tree.data)[beside]
+    middle = patches.mean(axis=1)
+    spread = patches - middle[:, None]
+    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))
+    flatness = 1.0 - np.sqrt(np.maximum(variance[:, 0], 0.0) / np.maximum(variance[:, 1], 1e-12))
+    normal = axes[:, :, 0]
+    return _Surface(normal, np.einsum("ni,ni->n", points_w - middle, normal), flatness)
+
+
+def _matched(tree: cKDTree, points_w: Array, reach_m: float, config: PolishConfig) -> tuple[Array, float]:
+    """Some of the points that have the map within reach, and the share of all that do."""
+    distance_m, _ = tree.query(points_w, distance_upper_bound=reach_m)
+    matched = np.flatnonzero(np.isfinite(distance_m))
+    share = len(matched) / max(len(points_w), 1)
+    return points_w[matched[:: 1 + len(matched) // config.points]], share
+
+
+def _rows(points_w: Array, normals: Array) -> tuple[Array, Array, float]:
+    """Jacobian ``(N, 6)`` of the distances to planes; rotation about the centre, lengths in radii."""
+    centre = points_w.mean(axis=0)
+    arms = points_w - centre
+    radius_m = max(float(np.sqrt(np.mean(np.sum(arms * arms, axis=1)))), 1e-9)
+    return np.concatenate([np.cross(arms / radius_m, normals), normals], axis=1), centre, radius_m
