@@ -208,8 +208,11 @@ def verify(archive: Path, expected_sha256: str | None) -> str:
 
 
 def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
     with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
 
 
 def extract(archive: Path, folder: Path) -> None:

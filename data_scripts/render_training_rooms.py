@@ -130,7 +130,7 @@ def room_views(seed: int, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
         T_world_camera = look_at(position, target, up)
         depth = renderer.depth(T_world_camera)
         known = depth[(depth > 0) & np.isfinite(depth)]
-        if len(known) < 0.98 * depth.size or np.percentile(known, 1) < 0.25 or known.max() > 12:
+        if len(known) < depth.size or np.percentile(known, 1) < 0.25 or known.max() > 12:
             continue
         colour, depth = renderer.render(T_world_camera)
         noise = rng.normal(0, rng.uniform(0, 3), colour.shape)

@@ -47,9 +47,12 @@ class BundleConfig(_Section):
     window: int = Field(10, ge=2, description="keyframes adjusted together after each new one")
     fixed: int = Field(10, ge=1, description="further keyframes that hold the window in place")
     final: bool = Field(True, description="adjust the whole map once at the end")
-    scale_sigma: float = Field(
-        0.1, ge=0, description="deviation of a keyframe's common relative depth error"
+    prior_inflation: float = Field(
+        2.0,
+        ge=1,
+        description="predicted depths of neighbouring pixels err together, so each counts this much less",
     )
+    scale_sigma: float = Field(0.1, ge=0, description="deviation of a keyframe's common relative depth error")
 
 
 class LoopConfig(_Section):
@@ -149,7 +152,8 @@ def _first_problem(error: ValidationError) -> str:
         section: type[BaseModel] = Config
         for part in problem["loc"][:-1]:
             annotation = section.model_fields[str(part)].annotation
-            assert isinstance(annotation, type) and issubclass(annotation, BaseModel)
+            assert isinstance(annotation, type)
+            assert issubclass(annotation, BaseModel)
             section = annotation
         return f"unknown setting '{name}'; allowed here: {', '.join(sorted(section.model_fields))}"
     return f"setting '{name}': {problem['msg']} (got {problem['input']!r})"

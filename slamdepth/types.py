@@ -97,9 +97,8 @@ class Camera:
             return points.copy()
         import cv2
 
-        return cv2.undistortPoints(
-            points[:, None], self.K, self.distortion_array, P=self.K
-        ).reshape(-1, 2)
+        undistorted = cv2.undistortPoints(points[:, None], self.K, self.distortion_array, P=self.K).reshape(-1, 2)
+        return np.asarray(undistorted, dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -110,6 +110,17 @@ def test_bad_sequences(spoil: Callable[[Path], None], expected: str, tiny_room: 
     assert done.stdout == ""
 
 
+def test_a_sequence_that_shows_nothing(tiny_room: Path, tmp_path: Path) -> None:
+    sequence = copy_of(tiny_room, tmp_path / "room")
+    black = cv2.imencode(".png", np.zeros((240, 320, 3), np.uint8))[1].tobytes()
+    for path in images(sequence):
+        replace_image(path, black)
+    done = call("run", sequence, "--depth", "sensor", "--output", tmp_path / "out")
+    assert done.returncode == 1, done.stderr
+    assert_one_line(done.stderr, "no frame could be placed")
+    assert not (tmp_path / "out").exists()
+
+
 BAD_CALLS = {
     "missing folder": (("run", "/no/such/folder", "--depth", "sensor"), "/no/such/folder: no such folder"),
     "a file": (("run", __file__, "--depth", "sensor"), "is a file"),

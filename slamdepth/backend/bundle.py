@@ -326,7 +326,7 @@ class _Solver:
     def point_covariance(self, state: _State) -> Floats:
         residual, weight, P = self._residual(state)
         Hpp = self._linearise(state, residual, weight, P)["Hpp"]
-        return np.linalg.inv(Hpp + np.eye(3) * 1e-3)
+        return np.asarray(np.linalg.inv(Hpp + np.eye(3) * 1e-3), dtype=np.float64)
 
 
 def _damped(H: Floats, damping: float) -> Floats:
@@ -350,4 +350,4 @@ def _solve_positive(S: Floats, rhs: Floats) -> Floats:
     try:
         return cho_solve(cho_factor(S, check_finite=False), rhs, check_finite=False)
     except LinAlgError:
-        return np.linalg.lstsq(S, rhs, rcond=None)[0]
+        return np.asarray(np.linalg.lstsq(S, rhs, rcond=None)[0], dtype=np.float64)

@@ -159,7 +159,7 @@ class _ProgressBar:
         if progress.status is not None:
             state = (
                 f"{progress.fps:.1f} fps · {progress.status.value} · "
-                f"{progress.keyframes} keyframes · {progress.loop_closures} loops"
+                f"keyframes {progress.keyframes} · loops {progress.loop_closures}"
             )
         stage = progress.stage.value
         is_new = stage != self._stage

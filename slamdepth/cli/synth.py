@@ -56,7 +56,8 @@ def synth_command(
     settings = SynthSettings.from_dict(
         {name: value for name, value in asked.items() if value is not None}, origin="command line"
     )
-    with Progress(console=error_console(), transient=True, disable=quiet) as bar:
+    err = error_console()
+    with Progress(console=err, transient=True, disable=quiet or not err.is_terminal) as bar:
         task = bar.add_task("rendering", total=settings.frames)
         folder = render_sequence(output, settings, lambda done, total: bar.update(task, completed=done))
     if not quiet:

@@ -36,7 +36,8 @@ def train_depth_command(
     settings = TrainConfig.from_yaml(config)
     from slamdepth.depth.training.loop import train_depth
 
-    with Progress(console=error_console(), disable=quiet) as bar:
+    err = error_console()
+    with Progress(console=err, disable=quiet or not err.is_terminal) as bar:
         task = bar.add_task("starting", total=1.0)
         result = train_depth(
             settings,
@@ -112,7 +113,9 @@ def _frames(dataset: Dataset, stride: int, max_frames: int | None, quiet: bool) 
     from slamdepth.errors import ImageDecodeError
 
     indices = range(0, len(dataset), stride)[:max_frames]
-    for index in track(indices, "judging", console=error_console(), transient=True, disable=quiet):
+    err = error_console()
+    hidden = quiet or not err.is_terminal
+    for index in track(indices, "judging", console=err, transient=True, disable=hidden):
         try:
             yield dataset.read(index, with_depth=True)
         except ImageDecodeError as error:

@@ -19,21 +19,21 @@ def list_command(verbose: VerboseOption = False, quiet: QuietOption = False) -> 
     Example: slamdepth weights list
     """
     show_log()
-    from rich import box
-    from rich.table import Table
-
     from slamdepth.depth.weights import cache_dir, list_weights
 
-    table = Table(box=box.SIMPLE)
-    for column in ("name", "state", "MB", "sha256", "licence", "trained on"):
-        table.add_column(column, overflow="fold", justify="right" if column == "MB" else "left")
-    for entry in list_weights():
-        size = "" if entry.size_bytes is None else f"{entry.size_bytes / 1e6:.1f}"
-        digest = "" if entry.sha256 is None else f"{entry.sha256[:16]}..."
-        table.add_row(entry.name, entry.state, size, digest, entry.licence, entry.trained_on)
     out = console()
-    out.print(table)
-    out.print(f"cache: {cache_dir()}", markup=False)
+    for entry in list_weights():
+        size = "" if entry.size_bytes is None else f", {entry.size_bytes / 1e6:.1f} MB"
+        out.print(f"{entry.name}: {entry.state}{size}", style="bold", markup=False)
+        for name, value in (
+            ("file", entry.path),
+            ("sha256", entry.sha256),
+            ("licence", entry.licence),
+            ("trained on", entry.trained_on),
+        ):
+            if value is not None:
+                out.print(f"  {name:<11}{value}", markup=False, soft_wrap=True)
+    out.print(f"cache: {cache_dir()}", markup=False, soft_wrap=True)
 
 
 @app.command("pull")

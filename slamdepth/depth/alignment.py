@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 DEFAULT_SIGMA_LOG = 0.25
 """Deviation of log depth assumed where a model gives none."""
 
+RELIEF_SIGMA = 0.4
+"""How much log depth varies over an image of a room, as a standard deviation."""
+
 MAX_ANCHORS = 300
 
 
@@ -139,6 +142,30 @@ def log_depth_at(prediction: DepthPrediction, px: Floats) -> tuple[Floats, Float
     )
 
 
+def prior_log_depth_at(prediction: DepthPrediction, px: Floats) -> tuple[Floats, Floats]:
+    """Prior log depth and deviation at raw pixels ``(N, 2)``: the prediction as far as it is sure.
+
+    Rooms have a relief of their own: log depth varies over an image by about
+    ``RELIEF_SIGMA``. Weighed against that (the posterior mean of two Gaussians), an unsure
+    prediction shrinks towards a wall at its own median distance. Wrong relief is worse
+    than none: it bends rays so that a sideways motion looks like a turn.
+    """
+    log, sigma = log_depth_at(prediction, px)
+    centre, gain = _shrinkage(log, sigma, _centre(prediction))
+    return centre + gain * (log - centre), sigma * np.sqrt(gain)
+
+
+def _shrinkage(log: Floats, sigma: Floats, centre: float) -> tuple[float, Floats]:
+    return centre, RELIEF_SIGMA**2 / (RELIEF_SIGMA**2 + sigma**2)
+
+
+def _centre(prediction: DepthPrediction) -> float:
+    """Median log depth of the whole image."""
+    values = prediction.values[::4, ::4]
+    log = _log_metric(prediction, values)
+    return float(np.nanmedian(log)) if np.isfinite(log).any() else 0.0
+
+
 def _log_metric(prediction: DepthPrediction, values: NDArray[np.float32]) -> Floats:
     if prediction.kind is not DepthKind.METRIC:
         raise TrackingError(
@@ -209,6 +236,8 @@ def apply_field(field: DepthField, prediction: DepthPrediction, step_px: int = 8
     import cv2
 
     log, sigma = log_depth_of(prediction)
+    centre, gain = _shrinkage(log, sigma, _centre(prediction))
+    log, sigma = centre + gain * (log - centre), sigma * np.sqrt(gain)
     height, width = log.shape
     rows, cols = np.arange(0, height, step_px), np.arange(0, width, step_px)
     grid_u, grid_v = np.meshgrid(cols, rows)

@@ -118,7 +118,7 @@ class OrbExtractor:
         import cv2
 
         self._config = config
-        self._orb = cv2.ORB_create(
+        self._orb = cv2.ORB.create(
             nfeatures=config.count * self.candidates_per_keypoint,
             scaleFactor=config.scale_factor,
             nlevels=config.levels,

@@ -61,7 +61,7 @@ def pairs_within(query_px: Floats, radius_px: Floats, px: Floats) -> tuple[Ints,
 
 def _pairs_in_grid(query_px: Floats, radius_px: Floats, px: Floats) -> tuple[Ints, Ints]:
     """:func:`pairs_within` over square cells of the largest radius: three rows of cells hold all."""
-    cell = float(radius_px.max())
+    cell = max(float(radius_px.max()), 8.0)
     low = px.min(axis=0)
     target_cell = np.floor((px - low) / cell).astype(np.int64) + 1
     columns, rows = target_cell[:, 0].max() + 3, target_cell[:, 1].max() + 3

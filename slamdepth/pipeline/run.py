@@ -17,12 +17,11 @@ from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.errors import DatasetError, InputError, OutputError, SlamdepthError
+from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.io import write_text, write_tum_trajectory
 from slamdepth.pipeline.folder import FILES, RunFolder, run_log, write_log_to
 from slamdepth.pipeline.options import (
     ProgressCallback,
-    RunInterrupted,
     RunOptions,
     RunProgress,
     RunResult,
@@ -63,6 +62,7 @@ def run(
     Raises:
         InputError: the sequence, the camera, a setting or the output place is wrong.
         WeightsError: weights are missing or damaged.
+        TrackingError: no frame could be placed.
         RunInterrupted: ``stop`` was set before the first frame.
     """
     tell = progress or (lambda state: None)
@@ -98,12 +98,12 @@ def run(
                 progress=tell,
                 stop=stopped,
             )
-        except (InputError, RunInterrupted) as error:
+        except SlamdepthError as error:
             if not isinstance(error, OutputError):  # of a full disk, say, what is there is worth keeping
                 folder.discard()
             raise
         except BaseException:
-            logger.exception("the run broke off")
+            logger.debug("the run broke off", exc_info=True)
             raise
         return _finish(dataset, model, tracked, folder, options, config, tell)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from slamdepth.backend.bundle import BundleProblem, BundleResult, bundle_adjust
 from slamdepth.config import Config
-from slamdepth.depth.alignment import DepthField, fit_depth_field, log_depth_at
+from slamdepth.depth.alignment import DepthField, fit_depth_field, log_depth_at, prior_log_depth_at
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, invert, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
@@ -57,11 +57,11 @@ class LocalMapper:
 
     def _give_birth(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
         features, config = keyframe.features, self._config.depth
-        log, sigma = log_depth_at(prediction, features.raw_px)
         if prediction.is_sensor:
-            keyframe.log_depth, keyframe.sigma_log = log, sigma
-            depth, sigma_birth = log, sigma
+            depth, sigma_birth = log_depth_at(prediction, features.raw_px)
+            keyframe.log_depth, keyframe.sigma_log = depth, sigma_birth
         else:
+            log, sigma = prior_log_depth_at(prediction, features.raw_px)
             field = self.depth_field(keyframe)
             correction, sigma_birth = field.correction(
                 features.raw_px, np.nan_to_num(log), np.nan_to_num(sigma, nan=1.0)
@@ -94,7 +94,7 @@ class LocalMapper:
         ok = z > 0.05
         seen, rows, z = seen[ok], rows[ok], z[ok]
         raw = keyframe.features.raw_px[seen]
-        log_predicted, sigma = log_depth_at(keyframe.prediction, raw)
+        log_predicted, sigma = prior_log_depth_at(keyframe.prediction, raw)
         return fit_depth_field(
             raw,
             log_predicted,
@@ -189,7 +189,8 @@ class LocalMapper:
             px=np.concatenate([f.px[at] for f, _, at in gather]),
             sigma_px=np.concatenate([f.sigma_px[at] for f, _, at in gather]),
             log_depth=np.concatenate([k.log_depth[at] for _, k, at in gather]),
-            sigma_log=np.concatenate([k.sigma_log[at] for _, k, at in gather]),
+            sigma_log=np.concatenate([k.sigma_log[at] for _, k, at in gather])
+            * (1.0 if is_sensor else self._config.bundle.prior_inflation),
             sigma_scale=0.0 if is_sensor else self._config.bundle.scale_sigma,
         )
         result = bundle_adjust(problem, iterations)

@@ -40,12 +40,20 @@ class PlaceConfig(_Section):
     samples: int = Field(200, ge=1, description="augmented samples drawn from it, spread over its frames")
 
 
-class DataConfig(_Section):
-    """Which pairs are seen, and how they are shown."""
+class SourceConfig(_Section):
+    """A folder of places. Each source has a feature cache of its own."""
 
     folder: str = Field(description="folder of the places; relative to $SLAMDEPTH_DATA if not absolute")
-    places: tuple[PlaceConfig, ...] = Field(min_length=1)
+    places: tuple[PlaceConfig, ...] = Field((), description="trained on")
     held_out: tuple[str, ...] = Field((), description="places judged on after training, never trained on")
+    limit: int | None = Field(
+        None, ge=1, description="only so many of the samples, a random choice; leaves the others' views alone"
+    )
+
+
+class ViewConfig(_Section):
+    """How a pair is shown to the backbone."""
+
     rows: int = Field(238, ge=28, multiple_of=14, description="height of the network input")
     columns: int = Field(322, ge=28, multiple_of=14, description="width of the network input")
     min_depth_m: float = Field(0.2, gt=0)
@@ -89,7 +97,8 @@ class TrainConfig(_Section):
     trained_on: str = Field("", description="said of the head wherever it is used; its places if empty")
     licence: str = Field("unknown", description="licence of the head")
     output: str = Field(description="file the head is written to")
-    data: DataConfig
+    sources: tuple[SourceConfig, ...] = Field(min_length=1)
+    view: ViewConfig = ViewConfig()
     head: HeadConfig = HeadConfig()
     loss: LossConfig = LossConfig()
 

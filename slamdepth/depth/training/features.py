@@ -19,7 +19,7 @@ import numpy as np
 
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, normalised
 from slamdepth.depth.training.augment import View, augmented_view, plain_view
-from slamdepth.depth.training.config import DataConfig
+from slamdepth.depth.training.config import ViewConfig
 from slamdepth.depth.training.data import Place
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def build_cache(
     folder: Path,
     places: list[Place],
     keys: list[SampleKey],
-    config: DataConfig,
+    config: ViewConfig,
     backbone: DinoV2,
     taps: tuple[int, ...],
     seed: int,
@@ -133,7 +133,7 @@ def build_cache(
     )  # fmt: skip
 
 
-def make_view(places: list[Place], key: SampleKey, config: DataConfig, seed: int) -> View:
+def make_view(places: list[Place], key: SampleKey, config: ViewConfig, seed: int) -> View:
     """The view ``key`` names; the same for the same seed whatever else is made."""
     place = places[key.place]
     frame = place.read(key.frame)
@@ -157,7 +157,7 @@ def encode(
 
 
 def _open_arrays(
-    folder: Path, count: int, config: DataConfig, backbone: DinoV2, taps: tuple[int, ...]
+    folder: Path, count: int, config: ViewConfig, backbone: DinoV2, taps: tuple[int, ...]
 ) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     rows, columns = config.rows, config.columns

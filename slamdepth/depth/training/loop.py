@@ -25,8 +25,8 @@ from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2
 from slamdepth.depth.head import DepthHead, HeadEnsemble, HeadShape, save_head
 from slamdepth.depth.preprocess import normalised
-from slamdepth.depth.training.config import TrainConfig, digest
-from slamdepth.depth.training.data import Place, data_folder, open_place
+from slamdepth.depth.training.config import SourceConfig, TrainConfig, digest
+from slamdepth.depth.training.data import data_folder, open_place
 from slamdepth.depth.training.features import FeatureCache, build_cache, plan_plain, plan_samples
 from slamdepth.depth.training.losses import total_loss
 from slamdepth.errors import ConfigError, OutputError
@@ -78,17 +78,17 @@ def train_depth(
         OutputError: the output cannot be written.
     """
     tell = progress or (lambda what, share: None)
-    both = {place.name for place in config.data.places} & set(config.data.held_out)
+    trained = {(s.folder, place.name) for s in config.sources for place in s.places}
+    both = trained & {(s.folder, name) for s in config.sources for name in s.held_out}
     if both:
-        raise ConfigError(f"setting 'data.held_out': {sorted(both)[0]} is also trained on")
+        raise ConfigError(f"setting 'sources': {min(both)[1]} is held out and also trained on")
+    if not trained:
+        raise ConfigError("setting 'sources': there is no place to train on")
     output = Path(config.output)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{output.parent}: cannot be made: {error.strerror}") from error
-    folder = data_folder(config.data.folder)
-    places = [open_place(folder / place.name) for place in config.data.places]
-    judged = [open_place(folder / name) for name in config.data.held_out]
     backbone_sha256 = "given"
     if backbone is None:
         file = store.find_backbone(config.backbone)
@@ -96,35 +96,33 @@ def train_depth(
         backbone = load_dinov2(file, device)
 
     taps = config.head.taps
-    key = digest(config.data, taps, config.seed, backbone_sha256)
-    root = store.cache_dir() / "features"
-    samples = [place.samples for place in config.data.places]
-    keys = plan_samples(places, samples, config.seed)
-    cache = build_cache(
-        root / key, places, keys, config.data, backbone, taps, config.seed, device=device, progress=progress
-    )
+    caches = [
+        cache
+        for source in config.sources
+        if (cache := _training_cache(source, config, backbone, backbone_sha256, device, progress)) is not None
+    ]
     shape = HeadShape(
         taps, backbone.dim, config.head.dim, config.head.blocks, config.head.guide_dim, config.members
     )
     ensemble = HeadEnsemble(shape)
     losses = []
     for member in range(config.members):
-        head, history = _train_member(config, cache, shape, member, device, tell)
+        head, history = _train_member(config, caches, shape, member, device, tell)
         ensemble.members[member].load_state_dict(head.state_dict())
         losses.append(history)
     ensemble.eval().to(device)
 
     held_out, ratios = {}, []
-    for index, place in enumerate(judged):
-        where = root / digest(config.data, taps, config.seed, backbone_sha256, "plain", place.name)
-        plain = _plain_cache(where, judged, index, config, backbone, taps, device, progress)
-        held_out[place.name], ratio = judge(ensemble, plain, device)
-        ratios.append(ratio)
+    for source in config.sources:
+        for name in source.held_out:
+            plain = _judging_cache(source, name, config, backbone, backbone_sha256, device, progress)
+            held_out[name], ratio = judge(ensemble, plain, device)
+            ratios.append(ratio)
     ensemble.sigma_scale = config.sigma_scale
     if ratios:
         # Each place counts the same: the mean over places of the ratio that covers 68 %.
         ensemble.sigma_scale = float(np.mean([np.quantile(ratio, _ONE_SIGMA) for ratio in ratios]))
-    names = ", ".join(place.name for place in places)
+    names = ", ".join(place.name for source in config.sources for place in source.places)
     about = {
         "trained_on": config.trained_on or names,
         "licence": config.licence,
@@ -181,24 +179,55 @@ def judge(
     }, ratio
 
 
-def _plain_cache(
-    where: Path,
-    places: list[Place],
-    index: int,
+def _training_cache(
+    source: SourceConfig,
     config: TrainConfig,
     backbone: DinoV2,
-    taps: tuple[int, ...],
+    backbone_sha256: str,
+    device: str,
+    progress: Progress | None,
+) -> FeatureCache | None:
+    if not source.places:
+        return None
+    folder = data_folder(source.folder)
+    places = [open_place(folder / place.name) for place in source.places]
+    samples = [place.samples for place in source.places]
+    keys = plan_samples(places, samples, config.seed)[: source.limit]
+    where = _cache_folder(config, backbone_sha256, source.places, source.limit, [len(p) for p in places])
+    return build_cache(
+        where, places, keys, config.view, backbone, config.head.taps, config.seed,
+        device=device, progress=progress,
+    )  # fmt: skip
+
+
+def _judging_cache(
+    source: SourceConfig,
+    name: str,
+    config: TrainConfig,
+    backbone: DinoV2,
+    backbone_sha256: str,
     device: str,
     progress: Progress | None,
 ) -> FeatureCache:
-    keys = plan_plain(index, places[index], _JUDGED_VIEWS)
+    place = open_place(data_folder(source.folder) / name)
+    where = _cache_folder(config, backbone_sha256, "plain", name, len(place))
     return build_cache(
-        where, places, keys, config.data, backbone, taps, config.seed, device=device, progress=progress
-    )
+        where, [place], plan_plain(0, place, _JUDGED_VIEWS), config.view, backbone, config.head.taps,
+        config.seed, device=device, progress=progress,
+    )  # fmt: skip
+
+
+def _cache_folder(config: TrainConfig, *more: object) -> Path:
+    return store.cache_dir() / "features" / digest(config.view, config.head.taps, config.seed, *more)
 
 
 def _train_member(
-    config: TrainConfig, cache: FeatureCache, shape: HeadShape, member: int, device: str, tell: Progress
+    config: TrainConfig,
+    caches: list[FeatureCache],
+    shape: HeadShape,
+    member: int,
+    device: str,
+    tell: Progress,
 ) -> tuple[DepthHead, list[float]]:
     seed = config.seed * 1000 + member
     with torch.random.fork_rng(devices=[]):
@@ -207,7 +236,7 @@ def _train_member(
         optimiser = torch.optim.AdamW(
             head.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
-        path, key = _checkpoint_path(config, member), digest(config, member, len(cache))
+        path, key = _checkpoint_path(config, member), digest(config, member)
         history: list[float] = []
         if path.is_file():
             state = torch.load(path, map_location=device, weights_only=True)
@@ -219,7 +248,7 @@ def _train_member(
         epochs = config.coarse_epochs + config.fine_epochs
         for epoch in range(len(history), epochs):
             torch.manual_seed(seed + 1_000_003 * (epoch + 1))  # so that a resumed epoch drops the same
-            history.append(_epoch(config, cache, head, optimiser, epoch, seed, device))
+            history.append(_epoch(config, caches, head, optimiser, epoch, seed, device))
             partial = path.with_name(path.name + ".partial")
             torch.save(
                 {"key": key, "head": head.state_dict(), "optimiser": optimiser.state_dict(),
@@ -234,7 +263,7 @@ def _train_member(
 
 def _epoch(
     config: TrainConfig,
-    cache: FeatureCache,
+    caches: list[FeatureCache],
     head: DepthHead,
     optimiser: torch.optim.Optimizer,
     epoch: int,
@@ -242,13 +271,19 @@ def _epoch(
     device: str,
 ) -> float:
     head.train()
-    order = np.random.default_rng([seed, epoch]).permutation(len(cache))
-    steps = max(1, len(cache) // config.batch)
+    samples = np.array([(c, k) for c, cache in enumerate(caches) for k in range(len(cache))])
+    order = np.random.default_rng([seed, epoch]).permutation(len(samples))
+    steps = max(1, len(samples) // config.batch)
     is_fine = epoch >= config.coarse_epochs
     total = 0.0
     for step in range(steps):
-        chosen = order[step * config.batch : (step + 1) * config.batch]
-        tokens, class_tokens, image, target = _batch(cache, np.sort(chosen), device)
+        chosen = samples[np.sort(order[step * config.batch : (step + 1) * config.batch])]
+        parts = [
+            _batch(cache, chosen[chosen[:, 0] == c, 1], device)
+            for c, cache in enumerate(caches)
+            if (chosen[:, 0] == c).any()
+        ]
+        tokens, class_tokens, image, target = (torch.cat(part) for part in zip(*parts, strict=True))
         if is_fine:
             prediction = head(tokens, class_tokens, image)
         else:

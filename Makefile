@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+# make demo   everything from nothing: environment, weights, a sequence, the main job
+# make test   the tests
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+SOURCES := pyproject.toml constraints.txt README.md LICENSE \
+	$(shell find slamdepth -type f -not -name '*.pyc' -not -name '.*')
+
+.PHONY: demo test lint types layers check install install-dev format clean
+
+demo: install
+	$(BIN)/slamdepth weights pull
+	$(BIN)/slamdepth synth demo/room
+	$(BIN)/slamdepth run demo/room --depth dinov2 --output demo/run --overwrite
+
+test: install-dev
+	$(BIN)/pytest
+
+lint: install-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: install-dev
+	$(BIN)/mypy
+
+layers: install-dev
+	$(BIN)/lint-imports
+
+check: lint types layers test
+
+format: install-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+install: $(VENV)/.package
+install-dev: $(VENV)/.dev
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.package: $(SOURCES) | $(BIN)/python
+	$(PIP) .
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.package
+	$(PIP) '.[dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

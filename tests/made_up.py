@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A dataset and a tracker made up for the tests of the pipeline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from slamdepth.errors import CameraError, ImageDecodeError
+from slamdepth.types import Camera, Frame, Reconstruction, StepResult, TrackingStatus, Trajectory
+
+CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
+
+
+class MadeUpDataset:
+    """Frames numbered by their grey value; some images or depth images do not decode."""
+
+    name = "made-up"
+    path = Path("made-up")
+    camera = CAMERA
+    has_depth = True
+
+    def __init__(self, count: int, broken: tuple[int, ...] = (), broken_depth: tuple[int, ...] = ()) -> None:
+        self.timestamps_s = np.arange(count) / 10.0
+        self.broken, self.broken_depth = broken, broken_depth
+        self.without_depth: tuple[int, ...] = ()
+        self.ground_truth: Trajectory | None = None
+        self.notes: list[str] = []
+        self.wrong_size: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.timestamps_s)
+
+    def read(self, index: int, *, with_depth: bool = False) -> Frame:
+        if index in self.broken:
+            raise ImageDecodeError(f"{index}.png: the image does not decode")
+        if index == self.wrong_size:
+            raise CameraError(f"{index}.png: the image is 9x9, the camera says 8x6")
+        depth_m = None
+        if with_depth and index in self.broken_depth:
+            raise ImageDecodeError(f"depth/{index}.png: the image does not decode")
+        if with_depth and index not in self.without_depth:
+            depth_m = np.full((6, 8), 1.0 + index, np.float32)
+        image = np.full((6, 8, 3), index % 256, np.uint8)
+        return Frame(index, float(self.timestamps_s[index]), image, CAMERA, depth_m)
+
+
+def pose(x_m: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = x_m
+    return T
+
+
+class MadeUpTracker:
+    """Moves 1 m a frame; loses the frames it is told to."""
+
+    def __init__(self, lost: tuple[int, ...] = (), on_step: Callable[[Frame], None] | None = None) -> None:
+        self.lost, self.on_step = lost, on_step or (lambda frame: None)
+        self.seen: list[int] = []
+
+    def step(self, frame: Frame) -> StepResult:
+        self.on_step(frame)
+        self.seen.append(frame.index)
+        is_lost = frame.index in self.lost
+        status = TrackingStatus.LOST if is_lost else TrackingStatus.TRACKING
+        return StepResult(frame.index, frame.timestamp_s, status, None if is_lost else pose(frame.index))
+
+    def finish(self) -> Reconstruction:
+        placed = [i for i in self.seen if i not in self.lost]
+        trajectory = Trajectory(np.array(placed) / 10.0, np.array([pose(i) for i in placed]))
+        return Reconstruction(
+            trajectory, (), np.zeros((0, 3)), len(self.seen), len(placed), 0, 0, 0, {"tracking": 1.0}
+        )

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From predictions to metres of the map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slamdepth.depth.alignment import (
+    DEFAULT_SIGMA_LOG,
+    MAX_ANCHORS,
+    DepthField,
+    FieldSettings,
+    apply_field,
+    fit_depth_field,
+    log_depth_at,
+    log_depth_of,
+)
+from slamdepth.errors import TrackingError
+from slamdepth.types import DepthKind, DepthPrediction
+
+WIDTH, HEIGHT = 320, 240
+
+
+def grid(step: int = 20) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(10, WIDTH, step), np.arange(10, HEIGHT, step))
+    return np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
+
+
+def plane(px: np.ndarray) -> np.ndarray:
+    """Log depth of a slanted floor."""
+    return np.log(3.0 - 1.5 * px[:, 1] / HEIGHT)
+
+
+def prediction(values: np.ndarray | None = None, sigma: float | None = 0.2) -> DepthPrediction:
+    if values is None:
+        u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+        values = np.exp(plane(np.column_stack([u.ravel(), v.ravel()]))).reshape(HEIGHT, WIDTH)
+    values = values.astype(np.float32)
+    sigma_log = None if sigma is None else np.full(values.shape, sigma, np.float32)
+    return DepthPrediction(values, DepthKind.METRIC, sigma_log)
+
+
+def test_without_anchors_the_prior_is_left() -> None:
+    px = grid()
+    nothing = np.zeros(0)
+    field = fit_depth_field(
+        np.zeros((0, 2)), nothing, nothing, nothing, nothing, width=WIDTH, prior_offset=0.1
+    )
+    sigma = np.full(len(px), 0.2)
+    correction, after = field.correction(px, plane(px), sigma)
+    assert field.anchors == 0
+    np.testing.assert_allclose(correction, 0.1)
+    np.testing.assert_allclose(field.mean(px, plane(px), sigma), 0.1)
+    np.testing.assert_allclose(after, np.hypot(0.2, FieldSettings().common_sigma))
+
+
+@pytest.mark.parametrize("offset", [-0.4, 0.05, 0.4])
+def test_a_common_factor_is_found_everywhere(offset: float) -> None:
+    px = grid(40)
+    sigma = np.full(len(px), 0.2)
+    field = fit_depth_field(
+        px, plane(px), sigma, plane(px) + offset, np.full(len(px), 0.01), width=WIDTH
+    )
+    everywhere = grid(7)
+    correction, _ = field.correction(everywhere, plane(everywhere), np.full(len(everywhere), 0.2))
+    np.testing.assert_allclose(correction, offset, atol=0.02)
+    np.testing.assert_allclose(
+        field.mean(everywhere, plane(everywhere), np.full(len(everywhere), 0.2)), correction
+    )
+
+
+def test_a_smooth_bias_is_followed_and_doubt_shrinks_near_anchors() -> None:
+    def bias(px: np.ndarray) -> np.ndarray:
+        return 0.15 * np.sin(px[:, 0] / 80.0)
+
+    left = grid(14)
+    left = left[left[:, 0] < WIDTH / 2]
+    sigma = np.full(len(left), 0.3)
+    field = fit_depth_field(
+        left, plane(left), sigma, plane(left) + bias(left), np.full(len(left), 0.01), width=WIDTH
+    )
+    near, far = np.array([[80.0, 120.0]]), np.array([[310.0, 120.0]])
+    correction, doubt = field.correction(near, plane(near), np.array([0.3]))
+    assert correction[0] == pytest.approx(bias(near)[0], abs=0.03)
+    _, doubt_far = field.correction(far, plane(far), np.array([0.3]))
+    assert doubt[0] < 0.6 * doubt_far[0]
+    assert doubt_far[0] > 0.8 * 0.3
+    assert doubt[0] >= np.sqrt(FieldSettings().white_share) * 0.3 - 1e-9  # nobody's neighbour tells that
+    assert doubt_far[0] < np.hypot(0.3, FieldSettings().common_sigma)
+
+
+def test_anchors_on_another_surface_say_little() -> None:
+    """A wall behind a chair: same pixels, other depth, own error."""
+    px = np.tile([[160.0, 120.0]], (6, 1)) + np.arange(6)[:, None]
+    settings = FieldSettings(common_sigma=0.01)
+    field = fit_depth_field(
+        px, np.log(np.full(6, 1.0)), np.full(6, 0.3), np.log(np.full(6, 1.2)), np.full(6, 0.01),
+        width=WIDTH, settings=settings,
+    )  # fmt: skip
+    at = np.array([[162.0, 122.0]])
+    chair, chair_doubt = field.correction(at, np.log([1.0]), np.array([0.3]))
+    wall, wall_doubt = field.correction(at, np.log([4.0]), np.array([0.3]))
+    assert chair[0] > 0.7 * np.log(1.2)
+    assert abs(wall[0]) < 0.02
+    assert wall_doubt[0] > 0.95 * 0.3 > chair_doubt[0]
+
+
+def test_wrong_and_unknown_anchors_are_left_out() -> None:
+    px = grid(40)
+    truth = plane(px) + 0.1
+    truth[::10] += 2.0
+    predicted = plane(px)
+    predicted[1] = np.nan
+    doubt = np.full(len(px), 0.01)
+    doubt[2] = np.nan
+    field = fit_depth_field(px, predicted, np.full(len(px), 0.2), truth, doubt, width=WIDTH)
+    assert field.anchors == len(px) - len(truth[::10]) - 2
+    correction, after = field.correction(grid(9), plane(grid(9)), np.full(len(grid(9)), 0.2))
+    np.testing.assert_allclose(correction, 0.1, atol=0.02)
+    assert np.isfinite(after).all()
+
+
+def test_many_anchors_are_thinned() -> None:
+    rng = np.random.default_rng(0)
+    px = rng.uniform((0, 0), (WIDTH, HEIGHT), (2500, 2))
+    field = fit_depth_field(
+        px, plane(px), np.full(2500, 0.2), plane(px) + 0.2, rng.uniform(0.01, 0.1, 2500), width=WIDTH
+    )
+    assert field.anchors == MAX_ANCHORS
+    np.testing.assert_allclose(field.mean(px[:9], plane(px[:9]), np.full(9, 0.2)), 0.2, atol=0.03)
+
+
+@pytest.mark.parametrize("kind", [DepthKind.AFFINE_DEPTH, DepthKind.AFFINE_INVERSE_DEPTH])
+def test_relative_depth_is_refused(kind: DepthKind) -> None:
+    with pytest.raises(TrackingError, match=f"{kind.value} map cannot be read as metres"):
+        log_depth_of(replace(prediction(), kind=kind))
+
+
+def test_unknown_depth_is_nan() -> None:
+    values = np.array([[2.0, 0.0], [np.nan, -1.0], [np.inf, 1e-3]])
+    log, sigma = log_depth_of(prediction(values, sigma=None))
+    np.testing.assert_array_equal(np.isfinite(log), [[True, False], [False, False], [False, True]])
+    assert log[0, 0] == pytest.approx(np.log(2.0))
+    np.testing.assert_array_equal(sigma, DEFAULT_SIGMA_LOG)
+
+
+def test_log_depth_at_takes_the_nearest_pixel() -> None:
+    metric = prediction(np.arange(12.0).reshape(3, 4))
+    assert metric.sigma_log is not None
+    metric.sigma_log[2, 3] = 0.5
+    px = np.array([[1.4, 0.4], [2.6, 1.6], [-0.4, -0.4], [3.4, 2.4]])
+    log, sigma = log_depth_at(metric, px)
+    np.testing.assert_allclose(np.exp(log), [1, 11, np.nan, 11])
+    np.testing.assert_allclose(sigma, [0.2, 0.5, 0.2, 0.5])
+    np.testing.assert_array_equal(log_depth_at(prediction(sigma=None), px)[1], DEFAULT_SIGMA_LOG)
+    whole, _ = log_depth_of(metric)
+    np.testing.assert_array_equal(whole[[0, 2], [1, 3]], log[[0, 1]])
+    with pytest.raises(TrackingError, match="cannot be read as metres"):
+        log_depth_at(replace(metric, kind=DepthKind.AFFINE_DEPTH), px)
+
+
+def fitted(bias: float = 0.2, sigma: float = 0.2) -> DepthField:
+    px = grid(30)
+    return fit_depth_field(
+        px, plane(px), np.full(len(px), sigma), plane(px) + bias * px[:, 0] / WIDTH,
+        np.full(len(px), 0.01), width=WIDTH,
+    )  # fmt: skip
+
+
+def test_apply_field_is_the_field_at_every_pixel() -> None:
+    field = fitted()
+    metric = prediction()
+    dense = apply_field(field, metric)
+    assert dense.shape == (HEIGHT, WIDTH)
+    assert dense.dtype == np.float32
+    u, v = np.meshgrid(np.arange(0, WIDTH, 5), np.arange(0, HEIGHT, 5))
+    px = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
+    log = np.log(metric.values[v, u].ravel().astype(np.float64))
+    expected = np.exp(log + field.mean(px, log, np.full(len(px), 0.2)))
+    inside = (px < [WIDTH - 8, HEIGHT - 8]).all(axis=1)  # beyond the last node it is held
+    np.testing.assert_allclose(dense[v, u].ravel()[inside], expected[inside], rtol=2e-3)
+    np.testing.assert_allclose(dense[v, u].ravel(), expected, rtol=0.02)
+
+
+def test_apply_field_keeps_the_unknown_unknown() -> None:
+    metric = prediction()
+    metric.values[50:60, 100:140] = 0.0
+    metric.values[0, 0] = np.nan
+    dense = apply_field(fitted(), metric)
+    assert (dense[50:60, 100:140] == 0).all()
+    assert dense[0, 0] == 0
+    assert np.isfinite(dense).all()
+    assert (dense > 0).sum() == WIDTH * HEIGHT - 401
+    assert (apply_field(fitted(), prediction(np.zeros((HEIGHT, WIDTH)))) == 0).all()
+
+
+def test_an_unknown_doubt_spoils_no_neighbours() -> None:
+    metric = prediction()
+    assert metric.sigma_log is not None
+    metric.sigma_log[16, 16] = np.nan
+    dense = apply_field(fitted(), metric)
+    assert (dense > 0).sum() >= WIDTH * HEIGHT - 1
+
+
+def test_apply_field_without_anchors_is_the_prediction() -> None:
+    nothing = np.zeros(0)
+    field = fit_depth_field(np.zeros((0, 2)), nothing, nothing, nothing, nothing, width=WIDTH)
+    np.testing.assert_allclose(apply_field(field, prediction()), prediction().values, rtol=1e-6)

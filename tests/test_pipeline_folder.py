@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The run folder: nothing before its time, nothing of others touched, everything explained."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from slamdepth.errors import OutputError
+from slamdepth.pipeline.folder import FILES, RunFolder, run_log, write_log_to
+
+
+def test_a_default_run_folder_is_always_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    paths = set()
+    for _ in range(3):
+        folder = RunFolder.plan(None, "desk", overwrite=False)
+        folder.create()
+        assert folder.path.parts[0] == "runs"
+        assert folder.path.name.startswith("desk-")
+        paths.add(folder.path)
+    assert len(paths) == 3
+
+
+def test_planning_makes_nothing(tmp_path: Path) -> None:
+    RunFolder.plan(tmp_path / "a" / "b", "desk", overwrite=False)
+    assert not any(tmp_path.iterdir())
+
+
+def test_an_earlier_run_is_replaced_only_when_asked(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    RunFolder.plan(place, "desk", overwrite=False).create()
+    (place / "trajectory.txt").write_text("old")
+    (place / "mine.txt").write_text("notes")
+    with pytest.raises(OutputError, match="--overwrite"):
+        RunFolder.plan(place, "desk", overwrite=False)
+    RunFolder.plan(place, "desk", overwrite=True).create()
+    assert not (place / "trajectory.txt").exists()
+    assert (place / "mine.txt").read_text() == "notes"
+
+
+def test_a_folder_of_something_else_is_never_touched(tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text("another program's")
+    with pytest.raises(OutputError, match="holds no earlier run"):
+        RunFolder.plan(tmp_path, "desk", overwrite=True)
+
+
+def test_a_file_is_no_run_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(OutputError, match="file"):
+            RunFolder.plan(path, "desk", overwrite=True)
+
+
+def test_discarding_leaves_what_is_not_ours(tmp_path: Path) -> None:
+    for name in ("alone", "shared"):
+        folder = RunFolder.plan(tmp_path / name, "desk", overwrite=False)
+        folder.create()
+        if name == "shared":
+            (folder / "mine.txt").write_text("")
+        folder.discard()
+    assert not (tmp_path / "alone").exists()
+    assert [path.name for path in (tmp_path / "shared").iterdir()] == ["mine.txt"]
+
+
+def test_the_readme_lists_every_file(tmp_path: Path) -> None:
+    folder = RunFolder.plan(tmp_path / "run", "desk", overwrite=False)
+    folder.create()
+    text = (folder / "README.txt").read_text()
+    assert all(name in text for name in FILES)
+
+
+def test_the_log_has_what_was_said_before_there_was_a_folder(tmp_path: Path) -> None:
+    package = logging.getLogger("slamdepth")
+    level, handlers = package.level, list(package.handlers)
+    with run_log() as buffer:
+        logging.getLogger("slamdepth.somewhere").debug("before")
+        write_log_to(buffer, tmp_path / "log.txt")
+        logging.getLogger("slamdepth.somewhere").debug("after")
+        assert "after" in (tmp_path / "log.txt").read_text()  # at once: a killed run keeps it
+    assert "before" in (tmp_path / "log.txt").read_text()
+    assert (package.level, package.handlers) == (level, handlers)

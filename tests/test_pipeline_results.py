@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is made of a finished reconstruction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_up import MadeUpDataset, pose
+
+from slamdepth.pipeline.results import judge_depth, judge_trajectory, keyframe_trajectory, scale_sentence
+from slamdepth.types import DepthKind, DepthPrediction, Frame, Keyframe, Reconstruction, Trajectory
+
+
+def keyframe(number: int, scale: float, *, is_sensor: bool = False) -> Keyframe:
+    dataset = MadeUpDataset(number + 1)
+    depth = np.full((6, 8), (1.0 + number) * scale, np.float32)
+    return Keyframe(
+        number,
+        dataset.read(number),
+        pose(number),
+        depth,
+        None,
+        np.zeros((0, 2)),
+        1.0,
+        DepthPrediction(depth, DepthKind.METRIC, is_sensor=is_sensor),
+    )
+
+
+def test_predicted_depth_is_judged_as_the_model_gave_it() -> None:
+    score = judge_depth(MadeUpDataset(5), tuple(keyframe(i, 1.25) for i in (0, 2, 4)))
+    assert score is not None
+    assert score.frames == 3
+    assert score.metric.abs_rel == pytest.approx(0.25, abs=1e-6)
+    assert score.sequence_median.abs_rel == pytest.approx(0.0, abs=1e-6)
+    assert score.sequence_scale == pytest.approx(0.8, abs=1e-6)
+
+
+def test_a_sensor_is_not_judged_against_itself() -> None:
+    assert judge_depth(MadeUpDataset(1), (keyframe(0, 1.0, is_sensor=True),)) is None
+
+
+def test_keyframes_whose_depth_is_broken_are_left_out() -> None:
+    score = judge_depth(MadeUpDataset(2, broken_depth=(0,)), (keyframe(0, 2.0), keyframe(1, 1.0)))
+    assert score is not None
+    assert (score.frames, score.metric.abs_rel) == (1, 0.0)
+
+
+def test_a_trajectory_that_cannot_be_scored_is_a_note() -> None:
+    dataset = MadeUpDataset(5)
+    still = Trajectory(dataset.timestamps_s, np.tile(np.eye(4), (5, 1, 1)))
+    assert judge_trajectory(dataset, still) == (None, ())
+    dataset.ground_truth = still
+    score, notes = judge_trajectory(dataset, still)
+    assert score is None
+    assert "not scored" in notes[0]
+
+
+def test_keyframes_become_a_trajectory() -> None:
+    frames = (keyframe(0, 1.0), keyframe(3, 1.0))
+    trajectory = Trajectory(np.zeros(0), np.zeros((0, 4, 4)), is_metric=False)
+    found = keyframe_trajectory(Reconstruction(trajectory, frames, np.zeros((0, 3)), 0, 0, 0, 0, 0))
+    assert found.timestamps_s.tolist() == [0.0, 0.3]
+    assert found.T_world_camera[:, 0, 3].tolist() == [0.0, 3.0]
+    assert not found.is_metric
+    empty = keyframe_trajectory(Reconstruction(trajectory, (), np.zeros((0, 3)), 0, 0, 0, 0, 0))
+    assert len(empty) == 0
+
+
+def test_the_scale_is_told_honestly() -> None:
+    class Model:
+        name, kind, weights = "net", DepthKind.METRIC, ()
+
+        def predict(self, frame: Frame) -> DepthPrediction:
+            raise NotImplementedError
+
+    assert "measured" in scale_sentence(Model(), (keyframe(0, 1.0, is_sensor=True),))
+    assert "predicted by net" in scale_sentence(Model(), (keyframe(0, 1.0),))
+    Model.kind = DepthKind.AFFINE_INVERSE_DEPTH
+    assert "unknown" in scale_sentence(Model(), (keyframe(0, 1.0),))

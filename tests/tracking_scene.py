@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A short rendered walk, models of depth made up for it, and how well a tracker did."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slamdepth.config import Config
+from slamdepth.datasets.synth import SynthSettings, render_frames, synth_camera
+from slamdepth.depth.base import DepthModel
+from slamdepth.depth.sensor import SensorDepth
+from slamdepth.geometry import invert, umeyama
+from slamdepth.tracker import create_tracker
+from slamdepth.types import (
+    DepthKind,
+    DepthPrediction,
+    Frame,
+    Reconstruction,
+    StepResult,
+    TrackingStatus,
+    Trajectory,
+    WeightsInfo,
+)
+
+COUNT = 64
+SETTINGS = SynthSettings(frames=COUNT, width=320, height=240, seed=3)
+CAMERA = synth_camera(SETTINGS)
+CONFIG = Config.from_dict({"features": {"count": 600}})
+
+Change = Callable[[Frame], Frame]
+
+
+@lru_cache(maxsize=1)
+def walk() -> tuple[tuple[Frame, ...], NDArray[np.float64]]:
+    """All frames with exact depth, and their poses ``(COUNT, 4, 4)`` in the first camera."""
+    frames, poses = zip(*render_frames(SETTINGS, range(COUNT)), strict=True)
+    return frames, invert(poses[0]) @ np.stack(poses)
+
+
+def frames(indices: Iterable[int] = range(COUNT), change: Change | None = None) -> list[Frame]:
+    """Some frames of the walk, with ``change`` applied to each."""
+    chosen = [walk()[0][i] for i in indices]
+    return chosen if change is None else [change(frame) for frame in chosen]
+
+
+def colour_only(frame: Frame) -> Frame:
+    return replace(frame, depth_m=None)
+
+
+def grey(frame: Frame) -> Frame:
+    """As if a hand lay over the lens of the colour camera."""
+    return replace(frame, image_rgb=np.full_like(frame.image_rgb, 90))
+
+
+def covered(frame: Frame) -> Frame:
+    """As if a hand lay over both lenses."""
+    return replace(grey(frame), depth_m=np.zeros_like(frame.depth_m))
+
+
+class ConstantDepth:
+    """The worst honest network: it says two metres everywhere, and how little it believes that."""
+
+    name = "constant"
+    kind = DepthKind.METRIC
+    weights: tuple[WeightsInfo, ...] = ()
+
+    def __init__(self, depth_m: float = 2.0, sigma_log: float = 0.45) -> None:
+        self.depth_m, self.sigma_log = depth_m, sigma_log
+        self.calls = 0
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        self.calls += 1
+        shape = frame.image_rgb.shape[:2]
+        return DepthPrediction(
+            np.full(shape, self.depth_m, np.float32), self.kind, np.full(shape, self.sigma_log, np.float32)
+        )
+
+
+class Run:
+    """A tracker after some frames, and after :meth:`finish` its reconstruction."""
+
+    def __init__(
+        self, given: Iterable[Frame], model: DepthModel | None = None, config: Config = CONFIG
+    ) -> None:
+        self.tracker = create_tracker(CAMERA, model or SensorDepth(), config)
+        self.results: list[StepResult] = [self.tracker.step(frame) for frame in given]
+
+    def finish(self) -> Reconstruction:
+        return self.tracker.finish()
+
+    def statuses(self) -> Counter[TrackingStatus]:
+        return Counter(result.status for result in self.results)
+
+    def status_of(self, index: int) -> TrackingStatus:
+        return next(r.status for r in self.results if r.index == index)
+
+
+def truth_of(trajectory: Trajectory) -> NDArray[np.float64]:
+    """True poses ``(N, 4, 4)`` at the times of a trajectory, in the first camera of the walk."""
+    index = np.rint(trajectory.timestamps_s * SETTINGS.fps).astype(int)
+    return walk()[1][index]
+
+
+def ate_m(trajectory: Trajectory, *, with_scale: bool = False) -> float:
+    """RMSE of positions after alignment, metres of the truth."""
+    estimate, truth = trajectory.T_world_camera[:, :3, 3], truth_of(trajectory)[:, :3, 3]
+    scale, R, t = umeyama(estimate, truth, with_scale)
+    return float(np.sqrt(np.mean(np.sum((scale * estimate @ R.T + t - truth) ** 2, axis=1))))
+
+
+def position_errors_m(trajectory: Trajectory) -> NDArray[np.float64]:
+    """``(N,)`` distances from the truth, with nothing aligned but the first camera."""
+    truth = truth_of(trajectory)
+    truth = invert(truth[0]) @ truth
+    return np.linalg.norm(trajectory.T_world_camera[:, :3, 3] - truth[:, :3, 3], axis=1)
