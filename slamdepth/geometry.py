@@ -58,11 +58,17 @@ def so3_exp(omega: Array) -> Array:
 
 
 def so3_log(R: Array) -> Array:
-    """Rotation vectors ``(..., 3)`` in radians of rotation matrices ``(..., 3, 3)``."""
-    from scipy.spatial.transform import Rotation
+    """Rotation vectors ``(..., 3)`` in radians of rotation matrices ``(..., 3, 3)``.
 
-    flat = np.asarray(R, dtype=np.float64).reshape(-1, 3, 3)
-    return Rotation.from_matrix(flat).as_rotvec().reshape(*R.shape[:-2], 3)
+    Through the quaternion, which stays accurate near zero and near half a turn.
+    """
+    quat = rotation_to_quat_xyzw(R)
+    vector, w = quat[..., :3], quat[..., 3]
+    length = np.linalg.norm(vector, axis=-1)
+    angle = 2.0 * np.arctan2(length, w)
+    small = length < 1e-9
+    factor = np.where(small, 2.0, angle / np.where(small, 1.0, length))
+    return factor[..., None] * vector
 
 
 def se3_exp(xi: Array) -> Array:
@@ -120,11 +126,31 @@ def quat_xyzw_to_rotation(quat_xyzw: Array) -> Array:
 
 
 def rotation_to_quat_xyzw(R: Array) -> Array:
-    """Quaternions ``(..., 4)`` x y z w with w >= 0 of rotation matrices ``(..., 3, 3)``."""
-    from scipy.spatial.transform import Rotation
+    """Quaternions ``(..., 4)`` x y z w with w >= 0 of rotation matrices ``(..., 3, 3)``.
 
-    flat = np.asarray(R, dtype=np.float64).reshape(-1, 3, 3)
-    return Rotation.from_matrix(flat).as_quat(canonical=True).reshape(*R.shape[:-2], 4)
+    By the largest of the four candidates (Shepperd 1978), so never by a small divisor.
+    """
+    R = np.asarray(R, dtype=np.float64)
+    m = R.reshape(-1, 3, 3)
+    d0, d1, d2 = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
+    squares = np.stack([d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1, d0 + d1 + d2], axis=1)
+    largest = squares.argmax(axis=1)
+    xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
+    wx, wy, wz = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
+    top = 1.0 + squares[np.arange(len(m)), largest]
+    candidates = np.stack(
+        [
+            np.stack([top, xy, xz, wx], axis=1),
+            np.stack([xy, top, yz, wy], axis=1),
+            np.stack([xz, yz, top, wz], axis=1),
+            np.stack([wx, wy, wz, top], axis=1),
+        ],
+        axis=1,
+    )
+    quat = candidates[np.arange(len(m)), largest]
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    quat *= np.where(quat[:, 3:] < 0, -1.0, 1.0)
+    return quat.reshape(*R.shape[:-2], 4)
 
 
 def project(camera: Camera, points_c: Array) -> tuple[Array, Array]:

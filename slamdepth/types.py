@@ -97,8 +97,8 @@ class Camera:
             return points.copy()
         import cv2
 
-        undistorted = cv2.undistortPoints(points[:, None], self.K, self.distortion_array, P=self.K).reshape(-1, 2)
-        return np.asarray(undistorted, dtype=np.float64)
+        undistorted = cv2.undistortPoints(points[:, None], self.K, self.distortion_array, P=self.K)
+        return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from slamdepth.depth.alignment import (
     fit_depth_field,
     log_depth_at,
     log_depth_of,
+    prior_log_depth_at,
 )
 from slamdepth.errors import TrackingError
 from slamdepth.types import DepthKind, DepthPrediction
@@ -61,9 +62,7 @@ def test_without_anchors_the_prior_is_left() -> None:
 def test_a_common_factor_is_found_everywhere(offset: float) -> None:
     px = grid(40)
     sigma = np.full(len(px), 0.2)
-    field = fit_depth_field(
-        px, plane(px), sigma, plane(px) + offset, np.full(len(px), 0.01), width=WIDTH
-    )
+    field = fit_depth_field(px, plane(px), sigma, plane(px) + offset, np.full(len(px), 0.01), width=WIDTH)
     everywhere = grid(7)
     correction, _ = field.correction(everywhere, plane(everywhere), np.full(len(everywhere), 0.2))
     np.testing.assert_allclose(correction, offset, atol=0.02)
@@ -178,8 +177,8 @@ def test_apply_field_is_the_field_at_every_pixel() -> None:
     assert dense.dtype == np.float32
     u, v = np.meshgrid(np.arange(0, WIDTH, 5), np.arange(0, HEIGHT, 5))
     px = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
-    log = np.log(metric.values[v, u].ravel().astype(np.float64))
-    expected = np.exp(log + field.mean(px, log, np.full(len(px), 0.2)))
+    log, sigma = prior_log_depth_at(metric, px)
+    expected = np.exp(log + field.mean(px, log, sigma))
     inside = (px < [WIDTH - 8, HEIGHT - 8]).all(axis=1)  # beyond the last node it is held
     np.testing.assert_allclose(dense[v, u].ravel()[inside], expected[inside], rtol=2e-3)
     np.testing.assert_allclose(dense[v, u].ravel(), expected, rtol=0.02)
@@ -205,7 +204,29 @@ def test_an_unknown_doubt_spoils_no_neighbours() -> None:
     assert (dense > 0).sum() >= WIDTH * HEIGHT - 1
 
 
-def test_apply_field_without_anchors_is_the_prediction() -> None:
+def test_apply_field_without_anchors_is_the_prior() -> None:
     nothing = np.zeros(0)
     field = fit_depth_field(np.zeros((0, 2)), nothing, nothing, nothing, nothing, width=WIDTH)
-    np.testing.assert_allclose(apply_field(field, prediction()), prediction().values, rtol=1e-6)
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    px = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
+    prior = np.exp(prior_log_depth_at(prediction(), px)[0]).reshape(HEIGHT, WIDTH)
+    np.testing.assert_allclose(apply_field(field, prediction()), prior, rtol=1e-5)
+    sure = prediction(sigma=1e-3)
+    np.testing.assert_allclose(apply_field(field, sure), sure.values, rtol=1e-4)
+
+
+def test_the_prior_shrinks_what_is_unsure_towards_the_middle() -> None:
+    px = grid(40)
+    middle = np.median(plane(grid(2)))
+    sure, sure_sigma = prior_log_depth_at(prediction(sigma=1e-3), px)
+    np.testing.assert_allclose(sure, plane(px), atol=1e-3)
+    np.testing.assert_allclose(sure_sigma, 1e-3, rtol=1e-3)
+    unsure, unsure_sigma = prior_log_depth_at(prediction(sigma=0.4), px)
+    assert (np.abs(unsure - middle) <= np.abs(plane(px) - middle) + 0.02).all()
+    assert np.std(unsure) < 0.7 * np.std(plane(px))
+    assert (unsure_sigma < 0.4).all()
+    flat, _ = prior_log_depth_at(prediction(sigma=50.0), px)
+    np.testing.assert_allclose(flat, middle, atol=0.03)
+    holes = prediction()
+    holes.values[10, 10] = 0.0
+    assert np.isnan(prior_log_depth_at(holes, px)[0]).sum() == (px == 10).all(axis=1).sum()

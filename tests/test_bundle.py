@@ -181,9 +181,7 @@ def test_agrees_with_gtsam() -> None:
 def test_a_common_depth_error_goes_into_the_scale_of_its_keyframe() -> None:
     exact = truth()
     wrong = np.array([0.0, 0.2, 0.0, -0.15, 0.0, 0.1])
-    problem = replace(
-        disturbed(exact), log_depth=exact.log_depth - wrong[exact.obs_camera], sigma_scale=0.3
-    )
+    problem = replace(disturbed(exact), log_depth=exact.log_depth - wrong[exact.obs_camera], sigma_scale=0.3)
     result = bundle_adjust(problem, iterations=(10, 10))
     np.testing.assert_allclose(result.log_scale, wrong, atol=0.01)
     assert pose_error(result.T_camera_world, exact.T_camera_world) < 3e-3

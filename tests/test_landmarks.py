@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def keyframe(id_: int, n: int = 8, T: np.ndarray | None = None) -> MapKeyframe:
 
 def born(landmarks: LandmarkMap, k: MapKeyframe, feature: list[int]) -> np.ndarray:
     n = len(feature)
-    position = np.random.default_rng(landmarks.size).normal(size=(n, 3)) + [0, 0, 5]
+    position = np.random.default_rng(landmarks.size).normal((0, 0, 5), size=(n, 3))
     return landmarks.add_points(k, np.array(feature, dtype=np.int64), position, np.tile(np.eye(3), (n, 1, 1)))
 
 
@@ -199,7 +200,7 @@ def test_a_long_chain_of_merges_is_followed_to_its_end() -> None:
     k = keyframe(0, 40)
     landmarks.add_keyframe(k)
     rows = born(landmarks, k, list(range(40)))
-    for loser, winner in zip(rows[:-1], rows[1:], strict=True):
+    for loser, winner in pairwise(rows):
         landmarks.merge(np.array([loser]), np.array([winner]))
     np.testing.assert_array_equal(landmarks.resolve(rows), rows[-1])
 

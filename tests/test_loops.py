@@ -70,7 +70,9 @@ class World:
         px, z = project(CAMERA, P)
         seen = np.flatnonzero((z > 0.3) & (px > 5).all(1) & (px[:, 0] < 635) & (px[:, 1] < 475))
         n = len(seen)
-        features = Features(px[seen], px[seen], np.zeros(n, np.int64), np.ones(n), np.zeros(n), descriptors[seen])
+        features = Features(
+            px[seen], px[seen], np.zeros(n, np.int64), np.ones(n), np.zeros(n), descriptors[seen]
+        )
         keyframe = MapKeyframe(
             id=k,
             frame=Frame(k, float(k), BLANK, CAMERA),
@@ -186,13 +188,17 @@ def test_points_keep_their_place_in_the_keyframe_of_their_birth(seed: int) -> No
     scales = np.exp(0.2 * rng.normal(size=5))
     logs = [k.log_depth.copy() for k in landmarks.keyframes]
     T_camera_old = invert(T_old)[birth]
-    before = np.einsum("nij,nj->ni", T_camera_old[:, :3, :3], landmarks.position_w[:n]) + T_camera_old[:, :3, 3]
+    before = (
+        np.einsum("nij,nj->ni", T_camera_old[:, :3, :3], landmarks.position_w[:n]) + T_camera_old[:, :3, 3]
+    )
     R = T_camera_old[:, :3, :3]
     covariance = R @ landmarks.covariance_w[:n] @ np.swapaxes(R, 1, 2)
     world.closer._bend(T_old, T_new, scales)
     np.testing.assert_allclose(np.stack([k.T_world_camera for k in landmarks.keyframes]), T_new, atol=1e-12)
     T_camera_new = invert(T_new)[birth]
-    after = np.einsum("nij,nj->ni", T_camera_new[:, :3, :3], landmarks.position_w[:n]) + T_camera_new[:, :3, 3]
+    after = (
+        np.einsum("nij,nj->ni", T_camera_new[:, :3, :3], landmarks.position_w[:n]) + T_camera_new[:, :3, 3]
+    )
     np.testing.assert_allclose(after, before * scales[birth][:, None], atol=1e-12)
     R = T_camera_new[:, :3, :3]
     np.testing.assert_allclose(
@@ -215,7 +221,6 @@ def test_no_loop_where_nothing_is_seen_twice() -> None:
 def test_no_loop_between_two_places_that_only_look_alike() -> None:
     """The same descriptors in another arrangement: words agree, geometry does not."""
     world = World(TURN - 3, turn_drift=0.0, scale_drift=0.0, is_sensor=True)
-    X, descriptors = ring()
     keyframe = world.map.keyframes[-1]
     first = world.map.keyframes[0].features
     rng = np.random.default_rng(5)

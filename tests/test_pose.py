@@ -126,7 +126,9 @@ def test_independent_depth_errors_average_out() -> None:
     noisy = X * np.exp(0.3 * np.random.default_rng(0).normal(size=(300, 1)))
     weighted = refine(np.eye(4), noisy, px, covariance=along_ray(noisy, 0.3))
     naive = refine(np.eye(4), noisy, px)
-    for better, worse in zip(errors(weighted.T_camera_world, T), errors(naive.T_camera_world, T), strict=True):
+    for better, worse in zip(
+        errors(weighted.T_camera_world, T), errors(naive.T_camera_world, T), strict=True
+    ):
         assert better < 0.45 * worse
     assert errors(weighted.T_camera_world, T)[1] < 0.5
     assert weighted.inliers.mean() > 0.85

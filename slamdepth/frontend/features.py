@@ -132,8 +132,8 @@ class OrbExtractor:
         px = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(n, 2)
         response = np.array([k.response for k in keypoints], dtype=np.float64)
         cell_px = np.sqrt(gray.shape[0] * gray.shape[1] / config.count) * 1.5
-        chosen = [keypoints[i] for i in spread(px, response, config.count, cell_px)]
-        chosen, descriptors = self._orb.compute(gray, chosen)
+        kept = [keypoints[i] for i in spread(px, response, config.count, cell_px)]
+        chosen, descriptors = self._orb.compute(gray, kept)
         n = len(chosen)
         if n == 0:
             descriptors = np.zeros((0, 32), dtype=np.uint8)
