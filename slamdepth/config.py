@@ -70,7 +70,7 @@ class DepthConfig(_Section):
     min_m: float = Field(0.1, gt=0, description="nearer depth is dropped")
     max_m: float = Field(10.0, gt=0, description="farther depth is dropped")
     max_sigma_log: float = Field(
-        0.6, gt=0, description="predicted pixels less sure than this never become map points"
+        1.0, gt=0, description="pixels whose log depth is less sure than this never become map points"
     )
 
 

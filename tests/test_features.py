@@ -42,7 +42,7 @@ def test_count_shapes_and_types() -> None:
     assert features.px.dtype == features.raw_px.dtype == np.float64
     assert features.descriptors.shape == (n, 32)
     assert features.descriptors.dtype == np.uint8
-    assert features.octave.shape == features.sigma_px.shape == features.angle_deg.shape == (n,)
+    assert features.octave.shape == features.sigma_px.shape == (n,)
     assert features.octave.min() >= 0
     assert features.octave.max() < 8
     np.testing.assert_allclose(features.sigma_px, 1.2**features.octave)
@@ -73,7 +73,7 @@ def test_a_blank_image_has_none(grey: int) -> None:
     assert len(features) == 0
     assert features.px.shape == (0, 2)
     assert features.descriptors.shape == (0, 32)
-    assert features.sigma_px.shape == features.angle_deg.shape == (0,)
+    assert features.sigma_px.shape == (0,)
 
 
 def test_an_image_too_small_for_a_patch_has_none() -> None:

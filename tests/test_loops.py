@@ -70,9 +70,7 @@ class World:
         px, z = project(CAMERA, P)
         seen = np.flatnonzero((z > 0.3) & (px > 5).all(1) & (px[:, 0] < 635) & (px[:, 1] < 475))
         n = len(seen)
-        features = Features(
-            px[seen], px[seen], np.zeros(n, np.int64), np.ones(n), np.zeros(n), descriptors[seen]
-        )
+        features = Features(px[seen], px[seen], np.zeros(n, np.int64), np.ones(n), descriptors[seen])
         keyframe = MapKeyframe(
             id=k,
             frame=Frame(k, float(k), BLANK, CAMERA),
@@ -226,7 +224,7 @@ def test_no_loop_between_two_places_that_only_look_alike() -> None:
     rng = np.random.default_rng(5)
     n = len(first)
     px = rng.uniform((5, 5), (635, 475), (n, 2))
-    fake = Features(px, px, first.octave, first.sigma_px, first.angle_deg, first.descriptors)
+    fake = Features(px, px, first.octave, first.sigma_px, first.descriptors)
     impostor = MapKeyframe(
         id=len(world.map.keyframes),
         frame=Frame(99, 99.0, BLANK, CAMERA),

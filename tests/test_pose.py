@@ -135,23 +135,6 @@ def test_independent_depth_errors_average_out() -> None:
     assert naive.inliers.mean() < 0.5
 
 
-def test_measured_depth_pulls_the_scale_of_the_step() -> None:
-    """Points 20 % too far, all unsure in common; the depth this camera measured says where it is."""
-    X, T = scene(200)
-    px, z = project(CAMERA, transform(T, X))
-    loose = along_ray(X, 0.5)
-    forward = se3_exp(np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])) @ T
-    # without baseline across the rays only depth can tell how far the camera moved along them
-    plain = refine(forward, X, px, covariance=loose)
-    told = refine(forward, X, px, covariance=loose, log_depth=np.log(z), sigma_log=np.full(200, 0.01))
-    assert errors(told.T_camera_world, T)[0] < 0.01
-    assert errors(told.T_camera_world, T)[0] <= errors(plain.T_camera_world, T)[0] + 1e-3
-    some = np.log(z)
-    some[::2] = np.nan
-    half = refine(forward, X, px, covariance=loose, log_depth=some, sigma_log=np.full(200, 0.01))
-    assert errors(half.T_camera_world, T)[0] < 0.01
-
-
 def test_points_behind_and_too_few_points() -> None:
     X, T = scene(60)
     px, _ = project(CAMERA, transform(T, X))

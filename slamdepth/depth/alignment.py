@@ -244,7 +244,8 @@ def apply_field(field: DepthField, prediction: DepthPrediction, step_px: int = 8
     px = np.column_stack([grid_u.ravel(), grid_v.ravel()]).astype(np.float64)
     fallback = float(np.nanmedian(log)) if np.isfinite(log).any() else 0.0
     at = np.nan_to_num(log[grid_v, grid_u].ravel(), nan=fallback)
-    coarse = field.mean(px, at, sigma[grid_v, grid_u].ravel()).reshape(grid_u.shape)
+    doubt = np.nan_to_num(sigma[grid_v, grid_u].ravel(), nan=DEFAULT_SIGMA_LOG)
+    coarse = field.mean(px, at, doubt).reshape(grid_u.shape)
     map_u, map_v = np.meshgrid(
         np.arange(width, dtype=np.float32) / step_px, np.arange(height, dtype=np.float32) / step_px
     )

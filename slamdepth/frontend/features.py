@@ -26,7 +26,6 @@ class Features:
         px: ``(N, 2)`` float64 pixels after undistortion; all geometry uses these.
         octave: ``(N,)`` int pyramid level, 0 the finest.
         sigma_px: ``(N,)`` float64 standard deviation of ``px``.
-        angle_deg: ``(N,)`` float64 orientation.
         descriptors: ``(N, 32)`` uint8 binary descriptors.
     """
 
@@ -34,7 +33,6 @@ class Features:
     px: NDArray[np.float64]
     octave: NDArray[np.int64]
     sigma_px: NDArray[np.float64]
-    angle_deg: NDArray[np.float64]
     descriptors: NDArray[np.uint8]
 
     def __len__(self) -> int:
@@ -144,6 +142,5 @@ class OrbExtractor:
             px=camera.undistort_points(raw_px),
             octave=octave,
             sigma_px=config.scale_factor ** octave.astype(np.float64),
-            angle_deg=np.array([k.angle for k in chosen], dtype=np.float64),
             descriptors=np.ascontiguousarray(descriptors),
         )

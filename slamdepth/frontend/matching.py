@@ -120,38 +120,6 @@ def best_matches(
     return q[kept], t[kept], d[kept]
 
 
-def match_near(
-    query_px: Floats,
-    radius_px: Floats,
-    query_descriptors: Bytes,
-    query_octave: Ints | None,
-    px: Floats,
-    descriptors: Bytes,
-    octave: Ints,
-    *,
-    max_distance: int = MAX_DISTANCE,
-    ratio: float = 0.9,
-) -> tuple[Ints, Ints, Ints]:
-    """Match descriptors to the features found near where they are expected.
-
-    Args:
-        query_px: ``(M, 2)`` expected pixels, within ``radius_px`` ``(M,)``.
-        query_octave: ``(M,)`` expected pyramid level; a feature may be one level off
-            below and above. None accepts every level.
-        px, descriptors, octave: the ``(N, ...)`` features of the image.
-
-    Returns:
-        ``(query, feature, distance)``, one to one.
-    """
-    q, t = pairs_within(query_px, radius_px, px)
-    if query_octave is not None:
-        step = octave[t] - query_octave[q]
-        ok = (step >= -1) & (step <= 1)
-        q, t = q[ok], t[ok]
-    d = hamming(query_descriptors[q], descriptors[t])
-    return best_matches(q, t, d, max_distance=max_distance, ratio=ratio)
-
-
 def match_all(
     a: Bytes, b: Bytes, *, max_distance: int = MAX_DISTANCE, ratio: float = 0.8
 ) -> tuple[Ints, Ints, Ints]:
@@ -171,20 +139,3 @@ def match_all(
     second = np.partition(table, 1, axis=1)[:, 1]
     keep = (backward[best] == rows) & (d <= max_distance) & (d <= ratio * second)
     return rows[keep], best[keep], d[keep].astype(np.int64)
-
-
-def consistent_rotation(
-    angle_a_deg: Floats, angle_b_deg: Floats, bins: int = 30, kept: int = 3
-) -> NDArray[np.bool_]:
-    """Which matches turn like the majority: a histogram of orientation differences (ORB-SLAM).
-
-    Returns:
-        ``(N,)`` mask, True in the ``kept`` fullest bins and their neighbours.
-    """
-    turn = np.mod(angle_a_deg - angle_b_deg, 360.0)
-    index = np.minimum((turn * bins / 360.0).astype(np.int64), bins - 1)
-    histogram = np.bincount(index, minlength=bins)
-    best = np.argsort(-histogram, kind="stable")[:kept]
-    best = best[histogram[best] >= max(1, 0.1 * histogram.max())]
-    near = np.unique(np.concatenate([best - 1, best, best + 1]) % bins)
-    return np.isin(index, near)

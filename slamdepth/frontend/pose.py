@@ -90,8 +90,6 @@ def refine_pose(
     px: Floats,
     sigma_px: Floats,
     *,
-    log_depth: Floats | None = None,
-    sigma_log: Floats | None = None,
     rounds: int = 4,
     iterations: int = 4,
     gate: float = CHI2_2DOF_95,
@@ -102,8 +100,6 @@ def refine_pose(
         T_camera_world: ``(4, 4)`` start.
         points_w: ``(N, 3)`` m; covariance_w: ``(N, 3, 3)`` m^2.
         px: ``(N, 2)`` undistorted pixels; sigma_px: ``(N,)``.
-        log_depth, sigma_log: ``(N,)`` optional measured log depth and its deviation;
-            NaN where there is none.
         rounds: outliers are judged anew after each; Huber kernel in all but the last.
         gate: squared whitened residual beyond which a match is an outlier.
     """
@@ -111,7 +107,6 @@ def refine_pose(
     n = len(points_w)
     active = np.ones(n, dtype=bool)
     H = np.eye(6) * 1e-6
-    has_depth = np.isfinite(log_depth) if log_depth is not None else np.zeros(n, dtype=bool)
     for round_ in range(rounds):
         robust = round_ < rounds - 1
         Pc = points_w @ T[:3, :3].T + T[:3, 3]
@@ -136,16 +131,6 @@ def refine_pose(
             Jw = Jp * weight[:, None, None]
             H = np.einsum("nki,nkj->ij", Jw, Jp)
             g = np.einsum("nki,nk->i", Jw, r)
-            if log_depth is not None and sigma_log is not None:
-                d = np.flatnonzero(has_depth[use])
-                if len(d):
-                    rd = (np.log(P[d, 2]) - log_depth[use[d]]) / sigma_log[use[d]]
-                    wd = 1.0 / (1.0 + rd * rd / 4.0)
-                    Jd = np.zeros((len(d), 1, 3))
-                    Jd[:, 0, 2] = 1.0 / (P[d, 2] * sigma_log[use[d]])
-                    Jdp = _pose_jacobian(Jd, P[d])[:, 0]
-                    H = H + np.einsum("n,ni,nj->ij", wd, Jdp, Jdp)
-                    g = g + np.einsum("n,ni,n->i", wd, Jdp, rd)
             step = -np.linalg.solve(H + np.eye(6) * 1e-9 * np.trace(H), g)
             T = se3_exp(step) @ T
             Pc = points_w @ T[:3, :3].T + T[:3, 3]
@@ -185,7 +170,7 @@ def _squared_residual(
 def pose_from_scratch(
     camera: Camera, points_w: Floats, px: Floats, *, seed: int, threshold_px: float = 6.0, minimum: int = 12
 ) -> tuple[Floats, NDArray[np.bool_]] | None:
-    """PnP without a start, by a robust consensus (OpenCV's USAC MAGSAC over P3P).
+    """PnP without a start, by a robust consensus (OpenCV's USAC local optimisation, MSAC score).
 
     Returns:
         ``(T_camera_world, inliers (N,))``, or None where no pose has ``minimum`` inliers.

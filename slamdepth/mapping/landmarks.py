@@ -140,10 +140,7 @@ class LandmarkMap:
         out = rows.copy()
         known = rows >= 0
         target = self.alias[rows[known]]
-        for _ in range(8):
-            further = self.alias[target]
-            if np.array_equal(further, target):
-                break
+        while not np.array_equal(further := self.alias[target], target):
             target = further
         out[known] = np.where(self.alive[target], target, -1)
         return out

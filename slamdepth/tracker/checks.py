@@ -3,8 +3,21 @@
 
 from __future__ import annotations
 
-from slamdepth.errors import CameraError, TrackingError
-from slamdepth.types import Camera, Frame
+from slamdepth.depth.base import DepthModel
+from slamdepth.errors import CameraError, ConfigError, TrackingError
+from slamdepth.types import Camera, DepthKind, Frame
+
+
+def check_model(model: DepthModel) -> None:
+    """Refuse a depth model whose numbers are not metres.
+
+    Raises:
+        ConfigError: its predictions are relative.
+    """
+    if model.kind is not DepthKind.METRIC:
+        raise ConfigError(
+            f"depth model '{model.name}' predicts {model.kind.value}; tracking needs a metric depth model"
+        )
 
 
 def check_frame(frame: Frame, camera: Camera, last_time_s: float, finished: bool) -> None:

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.config import Config
-from slamdepth.depth.alignment import log_depth_of
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.registration import CloudOdometry, CloudOdometryConfig, depth_to_cloud
 from slamdepth.geometry import invert, project, transform
-from slamdepth.tracker.checks import check_frame
+from slamdepth.tracker.checks import check_frame, check_model
 from slamdepth.tracker.threads import one_blas_thread
 from slamdepth.types import (
     Camera,
@@ -55,6 +54,7 @@ class CloudTracker:
         self._depth_model = depth_model or create_depth_model(
             self.config.depth.name, device=self.config.device, seed=self.config.seed
         )
+        check_model(self._depth_model)
         reach = CloudOdometryConfig(
             min_m=max(self.config.depth.min_m, 0.2), max_m=min(self.config.depth.max_m, 5.0)
         )
@@ -78,7 +78,6 @@ class CloudTracker:
             return self._result(frame, None, 0, False, timings)
         start = time.perf_counter()
         prediction = self._depth_model.predict(frame)
-        log_depth_of(prediction)  # refuses what is not metric
         timings["depth"] = (time.perf_counter() - start) * 1e3
         start = time.perf_counter()
         with one_blas_thread():

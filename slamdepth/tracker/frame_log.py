@@ -47,8 +47,14 @@ class FrameLog:
         return len(self._placed)
 
     def add(self, timestamp_s: float, features: Features, placement: Placement, is_keyframe: bool) -> None:
-        """Remember where a frame is, relative to the newest keyframe."""
+        """Remember where a frame is, relative to a keyframe that sees the same."""
         reference = self._map.keyframes[-1]
+        if (
+            not is_keyframe
+            and np.count_nonzero(np.isin(reference.point_ids, placement.point_ids)) < _MIN_MATCHES
+        ):
+            best = self._map.covisible(placement.point_ids, 1)
+            reference = self._map.keyframes[best[0]] if best else reference
         at = np.flatnonzero(placement.point_ids >= 0)
         self._placed.append(
             _Placed(

@@ -3,13 +3,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slamdepth.backend.bundle import BundleProblem, BundleResult, bundle_adjust
 from slamdepth.config import Config
-from slamdepth.depth.alignment import DepthField, fit_depth_field, log_depth_at, prior_log_depth_at
+from slamdepth.depth.alignment import (
+    DepthField,
+    fit_depth_field,
+    log_depth_at,
+    prior_log_depth_at,
+)
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, invert, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
@@ -49,36 +55,44 @@ class LocalMapper:
             point_ids=point_ids.copy(),
             log_depth=np.full(len(features), np.nan),
             sigma_log=np.full(len(features), np.nan),
-            prediction=prediction,
+            prediction=_compact(prediction),
         )
         self._map.add_keyframe(keyframe)
         self._give_birth(keyframe, prediction)
         return keyframe
 
+    def count_births(self, features: Features, prediction: DepthPrediction) -> int:
+        """How many points a first keyframe would give birth to."""
+        log, sigma = log_depth_at(prediction, features.raw_px)
+        return int(np.count_nonzero(self._may_be_born(log, sigma)))
+
+    def _may_be_born(self, log_depth: Floats, sigma_log: Floats) -> NDArray[np.bool_]:
+        """Where a depth is known, in range, and sure enough by the model's own word."""
+        config = self._config.depth
+        in_range = (log_depth > np.log(config.min_m)) & (log_depth < np.log(config.max_m))
+        return in_range & (sigma_log < config.max_sigma_log)
+
     def _give_birth(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
-        features, config = keyframe.features, self._config.depth
+        features = keyframe.features
+        depth, sigma = log_depth_at(prediction, features.raw_px)
+        sure = sigma < self._config.depth.max_sigma_log
         if prediction.is_sensor:
-            depth, sigma_birth = log_depth_at(prediction, features.raw_px)
-            keyframe.log_depth, keyframe.sigma_log = depth, sigma_birth
+            keyframe.log_depth, keyframe.sigma_log = depth, sigma
         else:
-            log, sigma = prior_log_depth_at(prediction, features.raw_px)
-            field = self.depth_field(keyframe)
-            correction, sigma_birth = field.correction(
-                features.raw_px, np.nan_to_num(log), np.nan_to_num(sigma, nan=1.0)
+            log, doubt = prior_log_depth_at(prediction, features.raw_px)
+            correction, sigma = self.depth_field(keyframe).correction(
+                features.raw_px, np.nan_to_num(log), np.nan_to_num(doubt, nan=1.0)
             )
             keyframe.scale = float(np.exp(np.median(correction)))
             depth = log + correction
-        free = keyframe.point_ids < 0
-        known = np.isfinite(depth)
-        inside = known & (depth > np.log(config.min_m)) & (depth < np.log(config.max_m))
-        born = np.flatnonzero(free & inside & (sigma_birth < config.max_sigma_log))
+        born = np.flatnonzero((keyframe.point_ids < 0) & sure & self._may_be_born(depth, sigma))
         if not prediction.is_sensor:
             keyframe.log_depth[born] = depth[born]
-            keyframe.sigma_log[born] = sigma_birth[born]
+            keyframe.sigma_log[born] = sigma[born]
         position_c = backproject(self._camera, features.px[born], np.exp(depth[born]))
         T_world_camera = keyframe.T_world_camera
         covariance_c = ray_covariance(
-            self._camera, features.px[born], position_c, sigma_birth[born], features.sigma_px[born]
+            self._camera, features.px[born], position_c, sigma[born], features.sigma_px[born]
         )
         R = T_world_camera[:3, :3]
         self._map.add_points(keyframe, born, transform(T_world_camera, position_c), R @ covariance_c @ R.T)
@@ -102,6 +116,7 @@ class LocalMapper:
             np.log(z),
             self._map.sigma_along_ray(rows, keyframe.center_w),
             width=self._camera.width,
+            prior_offset=float(np.log(self._map.keyframes[keyframe.id - 1].scale)) if keyframe.id else 0.0,
         )
 
     def search_neighbours(self, keyframe: MapKeyframe, limit: int = 10) -> None:
@@ -144,7 +159,7 @@ class LocalMapper:
         own = keyframe.point_ids[keyframe.point_ids >= 0]
         window = landmarks.covisible(own, config.window, minimum=10)
         if keyframe.id not in window:
-            window = [keyframe.id, *window[:-1]]
+            window = [keyframe.id, *window[: config.window - 1]]
         rows = landmarks.points_of(window)
         rows = rows[landmarks.observations[rows] >= 2]
         around = landmarks.shared_points(rows)
@@ -177,6 +192,8 @@ class LocalMapper:
         is_fixed = np.array([k in set(fixed) or k == 0 for k in used])
         if is_fixed.all():
             return None
+        if not is_fixed.any():
+            is_fixed[0] = True  # nothing outside holds the window: its oldest keyframe does
         gather = [(k.features, k, at) for k, at in zip(keyframes, feats, strict=True)]
         is_sensor = keyframes[0].prediction is not None and keyframes[0].prediction.is_sensor
         problem = BundleProblem(
@@ -230,6 +247,13 @@ class LocalMapper:
         lonely = (landmarks.observations[:n] < 2) & (age >= 3)
         behind = landmarks.alive[:n] & ~np.isfinite(landmarks.position_w[:n]).all(axis=1)
         landmarks.kill(np.flatnonzero(landmarks.alive[:n] & ((seldom & (age >= 1)) | lonely | behind)))
+
+
+def _compact(prediction: DepthPrediction) -> DepthPrediction:
+    """What a keyframe keeps: a sensor's deviation follows from its depth, a network's needs few digits."""
+    if prediction.is_sensor or prediction.sigma_log is None:
+        return replace(prediction, sigma_log=None)
+    return replace(prediction, sigma_log=prediction.sigma_log.astype(np.float16))
 
 
 def ray_covariance(

@@ -32,12 +32,10 @@ class Placement:
     Attributes:
         T_camera_world: ``(4, 4)``.
         point_ids: ``(N,)`` map point each feature agrees with, -1 for none.
-        information: ``(6, 6)`` of the pose.
     """
 
     T_camera_world: Floats
     point_ids: Ints
-    information: Floats
 
     @property
     def inliers(self) -> int:
@@ -137,23 +135,18 @@ class Localiser:
         features: Features,
         T_guess: Floats,
         recent_rows: Ints,
-        *,
-        log_depth: Floats | None = None,
-        sigma_log: Floats | None = None,
     ) -> Placement | None:
         """Place a frame near ``T_guess`` (camera from world); None where it does not hold."""
-        start = self._near(features, T_guess, recent_rows, log_depth, sigma_log)
+        start = self._near(features, T_guess, recent_rows)
         if start is None:
             return None
-        return self.refine_in_local_map(features, start, log_depth=log_depth, sigma_log=sigma_log)
+        return self.refine_in_local_map(features, start)
 
     def _near(
         self,
         features: Features,
         T_guess: Floats,
         rows: Ints,
-        log_depth: Floats | None,
-        sigma_log: Floats | None,
     ) -> Placement | None:
         visible = self.expected(T_guess, rows)
         need = self._config.tracking.min_inliers
@@ -161,7 +154,7 @@ class Localiser:
             found, at, _ = self.search(visible, features, radius, max(40.0, 1.5 * radius))
             if len(found) < need:
                 continue
-            placement = self._solve(features, T_guess, found, at, log_depth, sigma_log)
+            placement = self._solve(features, T_guess, found, at)
             if placement.inliers >= max(need, 0.4 * len(found)):
                 return placement
         return None
@@ -170,9 +163,6 @@ class Localiser:
         self,
         features: Features,
         start: Placement,
-        *,
-        log_depth: Floats | None = None,
-        sigma_log: Floats | None = None,
     ) -> Placement | None:
         """Search the whole neighbourhood of a first placement and place the frame by all of it."""
         rows = self.local_rows(start.point_ids)
@@ -180,12 +170,11 @@ class Localiser:
         found, at, _ = self.search(visible, features, 4.0, 30.0)
         if len(found) < self._config.tracking.min_inliers:
             return None
-        placement = self._solve(features, start.T_camera_world, found, at, log_depth, sigma_log)
-        self._map.visible[visible.rows] += 1
-        inlier_rows = placement.point_ids[placement.point_ids >= 0]
-        self._map.found[inlier_rows] += 1
+        placement = self._solve(features, start.T_camera_world, found, at)
         if placement.inliers < self._config.tracking.min_inliers:
             return None
+        self._map.visible[visible.rows] += 1
+        self._map.found[placement.point_ids[placement.point_ids >= 0]] += 1
         return placement
 
     def attach(self, features: Features, placement: Placement, rows: Ints) -> Placement:
@@ -194,7 +183,7 @@ class Localiser:
         found, at, _ = self.search(visible, features, 6.0, 30.0)
         point_ids = np.full(len(features), -1, dtype=np.int64)
         point_ids[at] = found
-        return Placement(placement.T_camera_world, point_ids, placement.information)
+        return Placement(placement.T_camera_world, point_ids)
 
     def local_rows(self, point_ids: Ints) -> Ints:
         """Points of the keyframes that see what the frame sees."""
@@ -207,8 +196,6 @@ class Localiser:
         T_start: Floats,
         rows: Ints,
         at: Ints,
-        log_depth: Floats | None,
-        sigma_log: Floats | None,
     ) -> Placement:
         estimate = refine_pose(
             self._camera,
@@ -217,12 +204,10 @@ class Localiser:
             self._map.covariance_w[rows],
             features.px[at],
             features.sigma_px[at],
-            log_depth=None if log_depth is None else log_depth[at],
-            sigma_log=None if sigma_log is None else sigma_log[at],
         )
         point_ids = np.full(len(features), -1, dtype=np.int64)
         point_ids[at[estimate.inliers]] = rows[estimate.inliers]
-        return Placement(estimate.T_camera_world, point_ids, estimate.information)
+        return Placement(estimate.T_camera_world, point_ids)
 
     def from_keyframe(
         self, features: Features, keyframe_id: int, *, minimum: int | None = None
@@ -245,7 +230,7 @@ class Localiser:
         if solution is None:
             return None
         T, inliers = solution
-        start = self._solve(features, T, rows[inliers], b[inliers], None, None)
+        start = self._solve(features, T, rows[inliers], b[inliers])
         if start.inliers < max(8, need // 2):
             return None
         return self.refine_in_local_map(features, start)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,6 +48,7 @@ class LoopCloser:
         self._localiser = localiser
         self.places = PlaceRecogniser()
         self._edges: list[Edge] = []
+        self._last: tuple[int, int] | None = None
         self.count = 0
 
     def add(self, keyframe: MapKeyframe) -> None:
@@ -65,10 +66,19 @@ class LoopCloser:
             placement, scale = verified
             correction = self._correct(keyframe, candidate, placement, scale)
             if correction is not None:
-                self.count += 1
+                if self._is_new(keyframe.id, candidate):
+                    self.count += 1
+                self._last = (keyframe.id, candidate)
                 log.info("loop closed: keyframe %d sees the place of keyframe %d", keyframe.id, candidate)
                 return correction
         return None
+
+    def _is_new(self, keyframe: int, candidate: int) -> bool:
+        """A revisit links many keyframes in a row; it is one loop."""
+        if self._last is None:
+            return True
+        gap = self._config.loops.min_gap
+        return keyframe - self._last[0] > gap or abs(candidate - self._last[1]) > gap
 
     def _candidates(self, keyframe: MapKeyframe) -> list[int]:
         newest = keyframe.id - self._config.loops.min_gap
@@ -115,6 +125,8 @@ class LoopCloser:
                 return None
             scales = result.scales
             self._bend(T_old, result.T_world_camera, scales)
+            edge = _rescaled(edge, scales)
+            self._edges = [_rescaled(e, scales) for e in self._edges]
         self._edges.append(edge)
         self._unite(keyframe, placement)
         return Correction(scales)
@@ -128,7 +140,10 @@ class LoopCloser:
         return (0.01, 0.02, 0.03)
 
     def _odometry_edges(self) -> list[Edge]:
-        """Neighbours in time, and every pair that shares many points: what holds the graph's shape."""
+        """Neighbours in time, and every pair that shares many points: what holds the graph's shape.
+
+        A keyframe's edges all come from the same observations, so each counts for its share only.
+        """
         keyframes = self._map.keyframes
         edges = []
         for j, keyframe in enumerate(keyframes):
@@ -138,7 +153,8 @@ class LoopCloser:
                 partners.add(j - 1)
             for i in sorted(partners):
                 T_i_j = keyframes[i].T_camera_world @ keyframe.T_world_camera
-                edges.append(Edge(i, j, T_i_j, 1.0, (0.01, 0.02, 0.02)))
+                share = np.sqrt(len(partners))
+                edges.append(Edge(i, j, T_i_j, 1.0, (0.01 * share, 0.02 * share, 0.02 * share)))
         return edges
 
     def _bend(self, T_old: Floats, T_new: Floats, scales: Floats) -> None:
@@ -176,3 +192,10 @@ class LoopCloser:
         both = np.flatnonzero((old >= 0) & (own >= 0) & (old != own))
         both = both[landmarks.alive[old[both]] & landmarks.alive[own[both]] & ~present[old[both]]]
         landmarks.merge(own[both], old[both])
+
+
+def _rescaled(edge: Edge, scales: Floats) -> Edge:
+    """The same measurement after the metres of each keyframe ``(K,)`` were multiplied."""
+    T_i_j = edge.T_i_j.copy()
+    T_i_j[:3, 3] *= scales[edge.i]
+    return replace(edge, T_i_j=T_i_j, scale_i_j=edge.scale_i_j * scales[edge.i] / scales[edge.j])

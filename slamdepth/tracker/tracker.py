@@ -17,9 +17,9 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.features import Features, create_extractor
-from slamdepth.geometry import invert, so3_exp, so3_log
-from slamdepth.mapping.landmarks import LandmarkMap
-from slamdepth.tracker.checks import check_frame
+from slamdepth.geometry import invert, rotation_angle_rad, so3_exp, so3_log
+from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.tracker.checks import check_frame, check_model
 from slamdepth.tracker.finish import build_reconstruction, optimise_everything
 from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
@@ -27,7 +27,14 @@ from slamdepth.tracker.localiser import Localiser, Placement
 from slamdepth.tracker.loop_closer import LoopCloser
 from slamdepth.tracker.rescue import CloudRescue
 from slamdepth.tracker.threads import one_blas_thread
-from slamdepth.types import Camera, DepthPrediction, Frame, Reconstruction, StepResult, TrackingStatus
+from slamdepth.types import (
+    Camera,
+    DepthPrediction,
+    Frame,
+    Reconstruction,
+    StepResult,
+    TrackingStatus,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,6 +45,7 @@ log = logging.getLogger(__name__)
 
 _MAX_EXTRAPOLATION = 3.0  # frame intervals the constant velocity is believed for
 _RELOCALISATION_CANDIDATES = 4
+_RESCUE_STEP_M, _RESCUE_TURN_RAD = 0.1, 0.15  # between keyframes without features
 
 
 class Tracker:
@@ -68,6 +76,7 @@ class Tracker:
         self._depth_model = depth_model or create_depth_model(
             self.config.depth.name, device=self.config.device, seed=self.config.seed
         )
+        check_model(self._depth_model)
         self._extractor = create_extractor(self.config.features)
         self._map = LandmarkMap()
         self._localiser = Localiser(camera, self.config, self._map)
@@ -84,6 +93,7 @@ class Tracker:
         self._relocalisations = 0
         self._rescues = 0
         self._finished = False
+        self._predicted_depth: tuple[Frame, DepthPrediction] | None = None
         self._timings: dict[str, float] = {}
         self._totals: dict[str, list[float]] = defaultdict(list)
 
@@ -132,9 +142,12 @@ class Tracker:
         return self._result(frame, status, placement, is_keyframe)
 
     def _start(self, frame: Frame, features: Features) -> StepResult:
-        if len(features) < self.config.tracking.min_inliers or not self._can_be_keyframe(frame):
+        need = self.config.tracking.min_inliers
+        if len(features) < need or not self._can_be_keyframe(frame):
             return self._result(frame, TrackingStatus.INITIALISING, None, False)
-        empty = Placement(np.eye(4), np.full(len(features), -1, dtype=np.int64), np.eye(6))
+        if self._mapper.count_births(features, self._predict_depth(frame)) < need:
+            return self._result(frame, TrackingStatus.INITIALISING, None, False)
+        empty = Placement(np.eye(4), np.full(len(features), -1, dtype=np.int64))
         placement = self._make_keyframe(frame, features, empty)
         self._remember_motion(frame, placement, placement)
         self._log.add(frame.timestamp_s, features, placement, True)
@@ -187,7 +200,10 @@ class Tracker:
     def _relocalise(self, features: Features) -> Placement | None:
         answers = self._loops.places.query(features.descriptors, top_k=_RELOCALISATION_CANDIDATES)
         newest = len(self._map.keyframes) - 1
+        tried = newest if self._last is not None else -1
         for k in dict.fromkeys([newest, *(k for k, _ in answers)]):
+            if k == tried:
+                continue
             placement = self._localiser.from_keyframe(
                 features, k, minimum=self.config.loops.min_inliers if k != newest else None
             )
@@ -202,7 +218,7 @@ class Tracker:
         if T is None:
             return None
         log.info("frame %d: too few features match; placed by registration of its depth", frame.index)
-        empty = Placement(T, np.full(len(features), -1, dtype=np.int64), np.eye(6))
+        empty = Placement(T, np.full(len(features), -1, dtype=np.int64))
         recent = self._map.points_of(
             [k.id for k in self._map.keyframes[-self.config.tracking.local_keyframes :]]
         )
@@ -213,8 +229,10 @@ class Tracker:
         return self._depth_model.name != "sensor" or frame.depth_m is not None
 
     def _predict_depth(self, frame: Frame) -> DepthPrediction:
-        with self._timed("depth"):
-            return self._depth_model.predict(frame)
+        if self._predicted_depth is None or self._predicted_depth[0] is not frame:
+            with self._timed("depth"):
+                self._predicted_depth = (frame, self._depth_model.predict(frame))
+        return self._predicted_depth[1]
 
     def _wants_keyframe(self, placement: Placement) -> bool:
         """The view has moved on when much of what the last keyframe saw is seen no more."""
@@ -226,10 +244,19 @@ class Tracker:
         self._reference_overlap = max(self._reference_overlap, still)
         tracking = self.config.tracking
         if placement.inliers < tracking.min_inliers:
-            return True
+            # rescued: worth a keyframe where there are features to go on with, or new surfaces
+            many = len(placement.point_ids) >= tracking.keyframe_min_inliers
+            return many or self._has_moved_on(placement, reference)
+        if self._reference_overlap < tracking.min_inliers:
+            return True  # the last keyframe saw too little to measure by
         if still < tracking.keyframe_overlap * self._reference_overlap:
             return True
         return placement.inliers < tracking.keyframe_min_inliers and still < 0.9 * self._reference_overlap
+
+    def _has_moved_on(self, placement: Placement, reference: MapKeyframe) -> bool:
+        D = placement.T_camera_world @ reference.T_world_camera
+        turned = float(rotation_angle_rad(D[:3, :3]))
+        return float(np.linalg.norm(D[:3, 3])) > _RESCUE_STEP_M or turned > _RESCUE_TURN_RAD
 
     def _make_keyframe(self, frame: Frame, features: Features, placement: Placement) -> Placement:
         prediction = self._predict_depth(frame)
@@ -251,7 +278,7 @@ class Tracker:
         with self._timed("mapping"):
             self._mapper.cull(keyframe)
         self._reference_overlap = 0
-        return Placement(keyframe.T_camera_world.copy(), keyframe.point_ids.copy(), placement.information)
+        return Placement(keyframe.T_camera_world.copy(), keyframe.point_ids.copy())
 
     def _remember_motion(self, frame: Frame, measured: Placement, final: Placement) -> None:
         """Velocity from the pose as measured, so that a correction of the map is not taken for motion."""
