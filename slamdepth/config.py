@@ -35,7 +35,7 @@ class TrackingConfig(_Section):
 
     min_inliers: int = Field(20, ge=6, description="fewer agreeing points and the frame is lost")
     keyframe_overlap: float = Field(
-        0.7, gt=0, lt=1, description="a keyframe is made when less of the last one is still seen"
+        0.5, gt=0, lt=1, description="a keyframe is made when less of the last one is still seen"
     )
     keyframe_min_inliers: int = Field(100, ge=0, description="... or when fewer points agree")
     local_keyframes: int = Field(12, ge=2, description="keyframes whose points are searched for")

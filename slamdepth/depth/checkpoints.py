@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find, read and strictly load the weights files of depth networks people have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from slamdepth.depth import weights as store
+from slamdepth.depth.layout import check_layout
+from slamdepth.errors import ConfigError, WeightsError
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    Module = TypeVar("Module", bound=nn.Module)
+
+_TRANSFORMERS_PREFIX = "backbone.embeddings."
+
+
+def find_checkpoint(model: str, file_names: Sequence[str], given: str | Path | None) -> Path:
+    """The weights file of ``model``: ``given``, else the first of ``file_names`` in the cache.
+
+    Raises:
+        WeightsError: one line: the file's name and where to put it.
+    """
+    if given is not None:
+        if Path(given).is_file():
+            return Path(given)
+        raise WeightsError(f"{given}: no such weights file for depth model '{model}'")
+    folder = store.cache_dir()
+    for name in file_names:
+        if (folder / name).is_file():
+            return folder / name
+    either = " or ".join(file_names)
+    raise WeightsError(f"depth model '{model}' has no weights: put {either} into {folder}, or name the file")
+
+
+def read_checkpoint(path: Path) -> dict[str, Tensor]:
+    """All tensors of a safetensors file or a PyTorch file, there also under ``state_dict``.
+
+    PyTorch files are read as data only: nothing in them is run.
+
+    Raises:
+        WeightsError: the file cannot be read or holds something else.
+    """
+    import torch
+
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(str(path))
+        loaded = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # pickle, zip and safetensors each raise their own types
+        first_line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise WeightsError(f"{path}: not a readable weights file: {first_line}") from error
+    if isinstance(loaded, Mapping) and isinstance(loaded.get("state_dict"), Mapping):
+        loaded = loaded["state_dict"]
+    if not isinstance(loaded, Mapping) or not loaded:
+        raise WeightsError(f"{path}: expected a table of tensors")
+    for name, value in loaded.items():
+        if not isinstance(value, torch.Tensor):
+            raise WeightsError(f"{path}: expected a table of tensors, but {name!r} is none")
+    return {str(name): value for name, value in loaded.items()}
+
+
+def load_strictly(
+    build: Callable[[], Module],
+    tensors: Mapping[str, Tensor],
+    origin: str,
+    *,
+    unused: Mapping[str, tuple[int, ...]] | None = None,
+    device: str = "cpu",
+) -> Module:
+    """Build a network and give it ``tensors``: every one it needs, and no other.
+
+    Args:
+        build: makes the network; called on the meta device, so that nothing is
+            allocated or drawn at random. The network must have no buffers of its own.
+        unused: tensors that official files have and inference does not need, with
+            their shapes; they may be there.
+
+    Returns:
+        The network in float32 and eval mode, frozen, on ``device``.
+
+    Raises:
+        WeightsError: a tensor is missing, extra, misshapen or no floating point; names it.
+    """
+    import torch
+
+    with torch.device("meta"):
+        network = build()
+    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    if any(name.startswith(_TRANSFORMERS_PREFIX) for name in tensors):
+        raise WeightsError(
+            f"{origin}: a transformers port of the weights ({_TRANSFORMERS_PREFIX}...); use the official file"
+        )
+    kept = {name: shape for name, shape in (unused or {}).items() if name in tensors}
+    found = {name: tuple(value.shape) for name, value in tensors.items()}
+    check_layout(found, {**expected, **kept}, origin)
+    for name in expected:
+        if not tensors[name].is_floating_point():
+            raise WeightsError(f"{origin}: tensor {name} is {tensors[name].dtype}, not floating point")
+    network.load_state_dict({name: tensors[name].float() for name in expected}, assign=True)
+    network.eval().requires_grad_(False)
+    return network.to(device)
+
+
+def check_device(device: str) -> None:
+    """Raise ConfigError where ``device`` is CUDA and there is none."""
+    import torch
+
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError(f"device '{device}': no CUDA device is available; use 'cpu'")

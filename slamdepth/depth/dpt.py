@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The network of Depth Anything V2 (Yang et al. 2024): a DINOv2 ViT and a DPT decoder.
+
+DPT is "Vision Transformers for Dense Prediction" (Ranftl et al. 2021). Parameter names are
+those of the official files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from slamdepth.depth.dinov2 import DinoV2
+
+
+@dataclass(frozen=True)
+class DptShape:
+    """Sizes of encoder and decoder.
+
+    Attributes:
+        dim, depth, heads: of the ViT.
+        taps: the blocks whose tokens the decoder reads.
+        features: channels of the decoder.
+        stages: channels of the four resolutions before that, finest first.
+        grid: side of the square position embedding.
+    """
+
+    dim: int
+    depth: int
+    heads: int
+    taps: tuple[int, int, int, int]
+    features: int
+    stages: tuple[int, int, int, int]
+    grid: int = 37
+
+
+SMALL = DptShape(384, 12, 6, (2, 5, 8, 11), 64, (48, 96, 192, 384))
+BASE = DptShape(768, 12, 12, (2, 5, 8, 11), 128, (96, 192, 384, 768))
+LARGE = DptShape(1024, 24, 16, (4, 11, 17, 23), 256, (256, 512, 1024, 1024))
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.conv2(F.relu(self.conv1(F.relu(x))))
+
+
+class _Fusion(nn.Module):
+    """Add a finer stage, refine, enlarge. The coarsest fusion has no stage to add, but the
+    official files carry its first residual unit all the same."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.resConfUnit1 = _Residual(channels)
+        self.resConfUnit2 = _Residual(channels)
+        self.out_conv = nn.Conv2d(channels, channels, 1)
+
+    def forward(self, x: Tensor, finer: Tensor | None, size: tuple[int, int]) -> Tensor:
+        if finer is not None:
+            x = x + self.resConfUnit1(finer)
+        x = F.interpolate(self.resConfUnit2(x), size=size, mode="bilinear", align_corners=True)
+        return self.out_conv(x)
+
+
+class _Scratch(nn.Module):
+    """Named as in MiDaS, whose decoder this is."""
+
+    def __init__(self, features: int, stages: tuple[int, int, int, int]) -> None:
+        super().__init__()
+        for index, channels in enumerate(stages, start=1):
+            self.add_module(f"layer{index}_rn", nn.Conv2d(channels, features, 3, padding=1, bias=False))
+        for index in range(1, 5):
+            self.add_module(f"refinenet{index}", _Fusion(features))
+        self.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
+        self.output_conv2 = nn.Sequential(
+            nn.Conv2d(features // 2, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, 1, 1)
+        )
+
+
+class DptDecoder(nn.Module):
+    """Tokens of four blocks to one value per pixel, before the last activation.
+
+    Args:
+        dim: width of the tokens.
+        features, stages: see :class:`DptShape`.
+        patch: pixels per token side.
+    """
+
+    def __init__(self, dim: int, features: int, stages: tuple[int, int, int, int], patch: int = 14) -> None:
+        super().__init__()
+        self.patch = patch
+        self.projects = nn.ModuleList(nn.Conv2d(dim, channels, 1) for channels in stages)
+        self.resize_layers = nn.ModuleList(
+            [
+                nn.ConvTranspose2d(stages[0], stages[0], 4, stride=4),
+                nn.ConvTranspose2d(stages[1], stages[1], 2, stride=2),
+                nn.Identity(),
+                nn.Conv2d(stages[3], stages[3], 3, stride=2, padding=1),
+            ]
+        )
+        self.scratch = _Scratch(features, stages)
+
+    def forward(self, grids: list[Tensor]) -> Tensor:
+        """``(B, dim, h, w)`` of each tapped block, to ``(B, h * patch, w * patch)``."""
+        rows, columns = grids[0].shape[-2:]
+        stages = []
+        for index, grid in enumerate(grids):
+            stage = self.resize_layers[index](self.projects[index](grid))
+            stages.append(self.scratch.get_submodule(f"layer{index + 1}_rn")(stage))
+        x = stages[3]
+        for index in (3, 2, 1, 0):
+            height, width = stages[max(index - 1, 0)].shape[-2:]
+            size = (height, width) if index else (2 * height, 2 * width)
+            fusion = self.scratch.get_submodule(f"refinenet{index + 1}")
+            x = fusion(x, stages[index] if index < 3 else None, size)
+        x = self.scratch.output_conv1(x)
+        size = (rows * self.patch, columns * self.patch)
+        x = F.interpolate(x, size=size, mode="bilinear", align_corners=True)
+        return self.scratch.output_conv2(x)[:, 0]
+
+
+class DepthAnything(nn.Module):
+    """Encoder and decoder; what the output means is up to the weights.
+
+    Args:
+        shape: sizes.
+        max_depth_m: None for a relative model, whose output is inverse depth up to scale
+            and shift; else the largest depth of a metric one.
+    """
+
+    def __init__(self, shape: DptShape, max_depth_m: float | None = None) -> None:
+        super().__init__()
+        self.taps = shape.taps
+        self.max_depth_m = max_depth_m
+        self.pretrained = DinoV2(shape.dim, shape.depth, shape.heads, grid=shape.grid)
+        self.depth_head = DptDecoder(shape.dim, shape.features, shape.stages)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """``(B, 3, H, W)`` as :class:`DinoV2` takes it to ``(B, H, W)``: metres where
+        ``max_depth_m`` is set, else inverse depth up to scale and shift, not negative."""
+        out = self.depth_head([grid for grid, _ in self.pretrained(image, self.taps)])
+        return torch.relu(out) if self.max_depth_m is None else torch.sigmoid(out) * self.max_depth_m

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every depth model that is one network and one weights file has in common."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slamdepth.depth.card import ModelCard
+from slamdepth.errors import CameraError
+from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
+
+SMALLEST_SIDE = 28
+LARGEST_ASPECT = 6.0
+
+
+class NetworkDepth(ABC):
+    """A :class:`~slamdepth.depth.base.DepthModel` around a network; subclasses say how it is run.
+
+    Attributes:
+        name, kind: as its card says.
+        card: what it was trained on and at which size and focal length.
+        weights: the files.
+        device: where it runs.
+    """
+
+    def __init__(self, card: ModelCard, weights: tuple[WeightsInfo, ...], device: str = "cpu") -> None:
+        self.name: str = card.name
+        self.kind: DepthKind = card.kind
+        self.card = card
+        self.weights = weights
+        self.device = device
+
+    @abstractmethod
+    def infer(self, image_rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], tuple[int, int]]:
+        """Run the network on ``(H, W, 3)``.
+
+        Returns:
+            Values ``(H, W)`` at the image's own resolution as the network gives them, and
+            the rows and columns the image was resized to for it (without padding).
+        """
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        """Values of :attr:`kind` for every raw (not undistorted) pixel of ``frame``.
+
+        Metric depth learnt at a focal length f0 and seen at f is multiplied by f / f0, both
+        in pixels of the network's input.
+
+        Raises:
+            CameraError: the image is too small or too narrow for the network.
+        """
+        height, width = frame.image_rgb.shape[:2]
+        if min(height, width) < SMALLEST_SIDE or max(height, width) > LARGEST_ASPECT * min(height, width):
+            raise CameraError(
+                f"frame {frame.index}: {width}x{height} pixels; the depth network needs sides of at least "
+                f"{SMALLEST_SIDE} pixels and an aspect of at most {LARGEST_ASPECT:g}:1"
+            )
+        values, size = self.infer(frame.image_rgb)
+        if self.kind is DepthKind.METRIC and self.card.native_focal_px is not None:
+            values = values * np.float32(focal_ratio(frame.camera, size, self.card.native_focal_px))
+        return DepthPrediction(np.ascontiguousarray(values, dtype=np.float32), self.kind)
+
+
+def focal_ratio(camera: Camera, size: tuple[int, int], native_focal_px: float) -> float:
+    """Focal length of ``camera``'s image resized to ``size`` (rows, columns) over the native one."""
+    rows, columns = size
+    scaled = camera.scaled(columns, rows)
+    return math.sqrt(scaled.fx * scaled.fy) / native_focal_px
