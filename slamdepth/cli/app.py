@@ -63,6 +63,9 @@ def _everything(
 
 def main() -> NoReturn:
     """Run the command line; errors made on purpose end in one line on standard error."""
+    # Read when PyTorch loads: waiting threads sleep. Spinning ones make the network ten times
+    # slower as soon as another program wants the processor.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         code = app(standalone_mode=False)
     except SlamdepthError as error:
