@@ -35,7 +35,10 @@ class TrackingConfig(_Section):
 
     min_inliers: int = Field(20, ge=6, description="fewer agreeing points and the frame is lost")
     keyframe_overlap: float = Field(
-        0.5, gt=0, lt=1, description="a keyframe is made when less of the last one is still seen"
+        0.6, gt=0, lt=1, description="a keyframe is made when less of the last one is still seen"
+    )
+    keyframe_overlap_start: float = Field(
+        0.85, gt=0, lt=1, description="the same for the first keyframes, which triangulate the first points"
     )
     keyframe_min_inliers: int = Field(100, ge=0, description="... or when fewer points agree")
     local_keyframes: int = Field(12, ge=2, description="keyframes whose points are searched for")
@@ -44,8 +47,8 @@ class TrackingConfig(_Section):
 class BundleConfig(_Section):
     """Local and global bundle adjustment."""
 
-    window: int = Field(10, ge=2, description="keyframes adjusted together after each new one")
-    fixed: int = Field(10, ge=1, description="further keyframes that hold the window in place")
+    window: int = Field(8, ge=2, description="keyframes adjusted together after each new one")
+    fixed: int = Field(6, ge=1, description="further keyframes that hold the window in place")
     final: bool = Field(True, description="adjust the whole map once at the end")
     prior_inflation: float = Field(
         2.0,

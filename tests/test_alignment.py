@@ -16,7 +16,6 @@ from slamdepth.depth.alignment import (
     apply_field,
     fit_depth_field,
     log_depth_at,
-    log_depth_of,
     prior_log_depth_at,
 )
 from slamdepth.errors import TrackingError
@@ -135,14 +134,15 @@ def test_many_anchors_are_thinned() -> None:
 @pytest.mark.parametrize("kind", [DepthKind.AFFINE_DEPTH, DepthKind.AFFINE_INVERSE_DEPTH])
 def test_relative_depth_is_refused(kind: DepthKind) -> None:
     with pytest.raises(TrackingError, match=f"{kind.value} map cannot be read as metres"):
-        log_depth_of(replace(prediction(), kind=kind))
+        log_depth_at(replace(prediction(), kind=kind), np.zeros((1, 2)))
 
 
 def test_unknown_depth_is_nan() -> None:
     values = np.array([[2.0, 0.0], [np.nan, -1.0], [np.inf, 1e-3]])
-    log, sigma = log_depth_of(prediction(values, sigma=None))
-    np.testing.assert_array_equal(np.isfinite(log), [[True, False], [False, False], [False, True]])
-    assert log[0, 0] == pytest.approx(np.log(2.0))
+    px = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [0.0, 2.0], [1.0, 2.0]])
+    log, sigma = log_depth_at(prediction(values, sigma=None), px)
+    np.testing.assert_array_equal(np.isfinite(log), [True, False, False, False, False, True])
+    assert log[0] == pytest.approx(np.log(2.0))
     np.testing.assert_array_equal(sigma, DEFAULT_SIGMA_LOG)
 
 
@@ -155,8 +155,6 @@ def test_log_depth_at_takes_the_nearest_pixel() -> None:
     np.testing.assert_allclose(np.exp(log), [1, 11, np.nan, 11])
     np.testing.assert_allclose(sigma, [0.2, 0.5, 0.2, 0.5])
     np.testing.assert_array_equal(log_depth_at(prediction(sigma=None), px)[1], DEFAULT_SIGMA_LOG)
-    whole, _ = log_depth_of(metric)
-    np.testing.assert_array_equal(whole[[0, 2], [1, 3]], log[[0, 1]])
     with pytest.raises(TrackingError, match="cannot be read as metres"):
         log_depth_at(replace(metric, kind=DepthKind.AFFINE_DEPTH), px)
 

@@ -14,7 +14,7 @@ uncertainty.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -118,22 +118,16 @@ class DepthField:
         return smooth + s.common_sigma**2
 
 
-def log_depth_of(prediction: DepthPrediction) -> tuple[Floats, Floats]:
-    """Natural log of a metric prediction and its deviation, ``(H, W)`` each; NaN = unknown.
+def log_depth_at(prediction: DepthPrediction, px: Floats) -> tuple[Floats, Floats]:
+    """Natural log of a metric prediction and its deviation at raw pixels ``(N, 2)``, nearest neighbour.
+
+    Returns:
+        ``(log depth (N,), sigma (N,))``; NaN where the depth is unknown.
 
     Raises:
         TrackingError: the prediction is not metric. Relative depth has to be made metric
             against known points first; taking disparity for depth is never right.
     """
-    sigma = prediction.sigma_log
-    shape = prediction.values.shape
-    return _log_metric(prediction, prediction.values), (
-        np.full(shape, DEFAULT_SIGMA_LOG) if sigma is None else sigma.astype(np.float64)
-    )
-
-
-def log_depth_at(prediction: DepthPrediction, px: Floats) -> tuple[Floats, Floats]:
-    """:func:`log_depth_of` at the nearest of raw pixels ``(N, 2)``, ``(N,)`` each; same errors."""
     u = np.clip(np.rint(px[:, 0]).astype(np.int64), 0, prediction.values.shape[1] - 1)
     v = np.clip(np.rint(px[:, 1]).astype(np.int64), 0, prediction.values.shape[0] - 1)
     sigma = prediction.sigma_log
@@ -151,12 +145,13 @@ def prior_log_depth_at(prediction: DepthPrediction, px: Floats) -> tuple[Floats,
     than none: it bends rays so that a sideways motion looks like a turn.
     """
     log, sigma = log_depth_at(prediction, px)
-    centre, gain = _shrinkage(log, sigma, _centre(prediction))
+    centre, gain = _centre(prediction), _gain(sigma)
     return centre + gain * (log - centre), sigma * np.sqrt(gain)
 
 
-def _shrinkage(log: Floats, sigma: Floats, centre: float) -> tuple[float, Floats]:
-    return centre, RELIEF_SIGMA**2 / (RELIEF_SIGMA**2 + sigma**2)
+def _gain(sigma_log: Any) -> Any:
+    """How much of a deviation from the image's median is kept, 0 to 1."""
+    return RELIEF_SIGMA**2 / (RELIEF_SIGMA**2 + sigma_log**2)
 
 
 def _centre(prediction: DepthPrediction) -> float:
@@ -228,28 +223,34 @@ def fit_depth_field(
     return DepthField(field._px, field._log, field._sigma, solved, factor, prior_offset, unit_px, settings)
 
 
-def apply_field(field: DepthField, prediction: DepthPrediction, step_px: int = 8) -> NDArray[np.float32]:
+def apply_field(field: DepthField, prediction: DepthPrediction, step_px: int = 16) -> NDArray[np.float32]:
     """The whole prediction in metres of the map, ``(H, W)`` float32, 0 = unknown.
 
-    The correction is smooth, so it is evaluated every ``step_px`` pixels and interpolated.
+    The correction is smooth, so it is evaluated about every ``step_px`` pixels and interpolated.
     """
     import cv2
 
-    log, sigma = log_depth_of(prediction)
-    centre, gain = _shrinkage(log, sigma, _centre(prediction))
-    log, sigma = centre + gain * (log - centre), sigma * np.sqrt(gain)
-    height, width = log.shape
-    rows, cols = np.arange(0, height, step_px), np.arange(0, width, step_px)
+    height, width = prediction.values.shape
+    # the grid ends on the last row and column: nothing is extrapolated
+    rows = np.linspace(0, height - 1, -(-(height - 1) // step_px) + 1)
+    cols = np.linspace(0, width - 1, -(-(width - 1) // step_px) + 1)
     grid_u, grid_v = np.meshgrid(cols, rows)
     px = np.column_stack([grid_u.ravel(), grid_v.ravel()]).astype(np.float64)
-    fallback = float(np.nanmedian(log)) if np.isfinite(log).any() else 0.0
-    at = np.nan_to_num(log[grid_v, grid_u].ravel(), nan=fallback)
-    doubt = np.nan_to_num(sigma[grid_v, grid_u].ravel(), nan=DEFAULT_SIGMA_LOG)
-    coarse = field.mean(px, at, doubt).reshape(grid_u.shape)
+    at, doubt = prior_log_depth_at(prediction, px)
+    centre = _centre(prediction)
+    doubt = np.nan_to_num(doubt, nan=DEFAULT_SIGMA_LOG)
+    coarse = field.mean(px, np.nan_to_num(at, nan=centre), doubt).reshape(grid_u.shape)
     map_u, map_v = np.meshgrid(
-        np.arange(width, dtype=np.float32) / step_px, np.arange(height, dtype=np.float32) / step_px
+        np.linspace(0, len(cols) - 1, width, dtype=np.float32),
+        np.linspace(0, len(rows) - 1, height, dtype=np.float32),
     )
     dense = cv2.remap(
         coarse.astype(np.float32), map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    return np.nan_to_num(np.exp(log + dense), nan=0.0).astype(np.float32)
+    values = prediction.values.astype(np.float32)
+    known = np.isfinite(values) & (values > 0)
+    log = np.log(np.where(known, values, np.float32(1.0)))
+    sigma = prediction.sigma_log
+    gain = _gain(DEFAULT_SIGMA_LOG if sigma is None else np.nan_to_num(sigma, nan=DEFAULT_SIGMA_LOG))
+    shrunk = np.float32(centre) + gain * (log - np.float32(centre))
+    return np.where(known, np.exp(shrunk + dense), np.float32(0.0)).astype(np.float32)

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a depth model says of itself, and the check that its numbers are metres."""
+"""What a depth model says of itself."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from slamdepth.depth.base import DepthModel
-from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind
 
 
@@ -31,16 +29,3 @@ class ModelCard:
     native_focal_px: float | None
     licence: str
     trained_on: str
-
-
-def require_metric(model: DepthModel) -> None:
-    """Refuse a model whose numbers are no metres, before they are taken for such.
-
-    Raises:
-        ConfigError: says what the model predicts instead.
-    """
-    if model.kind is not DepthKind.METRIC:
-        raise ConfigError(
-            f"depth model '{model.name}' predicts {model.kind.value}, which has no metres; "
-            "choose one that predicts metric depth"
-        )

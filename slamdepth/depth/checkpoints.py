@@ -54,8 +54,11 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
             return load_file(str(path))
         loaded = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # pickle, zip and safetensors each raise their own types
-        first_line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise WeightsError(f"{path}: not a readable weights file: {first_line}") from error
+        if "Weights only load failed" in str(error):
+            why = "it holds more than tensors and plain values, which is never run; save its state_dict()"
+        else:
+            why = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+        raise WeightsError(f"{path}: not a readable weights file: {why}") from error
     if isinstance(loaded, Mapping) and isinstance(loaded.get("state_dict"), Mapping):
         loaded = loaded["state_dict"]
     if not isinstance(loaded, Mapping) or not loaded:
@@ -78,7 +81,7 @@ def load_strictly(
 
     Args:
         build: makes the network; called on the meta device, so that nothing is
-            allocated or drawn at random. The network must have no buffers of its own.
+            allocated or drawn at random. It must keep no tensors outside its state.
         unused: tensors that official files have and inference does not need, with
             their shapes; they may be there.
 

@@ -153,10 +153,11 @@ def _prepared(image_rgb: NDArray[np.uint8], rows: int, columns: int, device: str
     """Resized bicubically in floating point, as the official code does, and normalised."""
     import cv2
 
-    image = image_rgb.astype(np.float32) / 255.0
+    image = image_rgb.astype(np.float32) / np.float32(255.0)
     if image.shape[:2] != (rows, columns):
-        image = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_CUBIC)
-    image = (image - np.float32(IMAGENET_MEAN)) / np.float32(IMAGENET_STD)
+        resized = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_CUBIC)
+        image = np.asarray(resized, dtype=np.float32)
+    image = (image - np.asarray(IMAGENET_MEAN, np.float32)) / np.asarray(IMAGENET_STD, np.float32)
     return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))[None]).to(device)
 
 

@@ -154,11 +154,11 @@ class DptHead(nn.Module):
 
     def forward(self, tapped: Tapped) -> Tensor:
         """Depth ``(B, about 16h, about 16w)`` in metres."""
-        stages = [
-            conv(stage) for conv, stage in zip(self.convs, self.reassemble_blocks(tapped), strict=True)
-        ]
+        stages = [conv(stage) for conv, stage in zip(self.convs, self.reassemble_blocks(tapped), strict=True)]
         x = self.fusion_blocks[0](stages[3])
-        for fusion, stage in zip(list(self.fusion_blocks)[1:], (stages[2], stages[1], stages[0]), strict=True):
+        for fusion, stage in zip(
+            list(self.fusion_blocks)[1:], (stages[2], stages[1], stages[0]), strict=True
+        ):
             x = fusion(x, stage)
         out = self.conv_depth(F.relu(self.project(x)))
         return torch.relu(out)[:, 0] + MIN_DEPTH_M

@@ -56,6 +56,7 @@ class Dinov2OfficialDepth(NetworkDepth):
             without it.
         head: in eval mode.
         card, weights, device: see :class:`NetworkDepth`.
+        taps: blocks the head reads; default: those of a ViT-S.
     """
 
     def __init__(
@@ -65,12 +66,13 @@ class Dinov2OfficialDepth(NetworkDepth):
         card: ModelCard,
         weights: tuple[WeightsInfo, ...],
         device: str = "cpu",
+        taps: tuple[int, ...] | None = None,
     ) -> None:
         super().__init__(card, weights, device)
         backbone.norm = nn.Identity()  # type: ignore[assignment]
         self._backbone = backbone.to(device)
         self._head = head.to(device)
-        self._taps = _TAPS[head.layers] if len(backbone.blocks) == 12 else tuple(range(head.layers))
+        self._taps = taps or _TAPS[head.layers]
 
     @classmethod
     def load(

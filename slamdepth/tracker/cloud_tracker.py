@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-_STRIDE_PX = 4
+_COLUMNS = 160  # points across a cloud, whatever the image's size
 
 
 class CloudTracker:
@@ -84,7 +84,7 @@ class CloudTracker:
             cloud = depth_to_cloud(
                 prediction.values,
                 self.camera,
-                stride=_STRIDE_PX,
+                stride=max(1, round(self.camera.width / _COLUMNS)),
                 min_m=self._range_m[0],
                 max_m=self._range_m[1],
             )

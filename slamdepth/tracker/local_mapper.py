@@ -166,7 +166,7 @@ class LocalMapper:
         around[window] = 0
         order = np.argsort(-around, kind="stable")[: config.fixed]
         fixed = [int(k) for k in order if around[k] > 0]
-        return self.adjust(window, fixed, rows, (4, 5))
+        return self.adjust(window, fixed, rows, (3, 3))
 
     def adjust(
         self, window: list[int], fixed: list[int], rows: Ints, iterations: tuple[int, ...]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _MAP_KEYFRAMES = 4
-_STRIDE_PX = 8
+_COLUMNS = 80  # points across a cloud, whatever the image's size
 
 
 class CloudRescue:
@@ -47,7 +47,7 @@ class CloudRescue:
         return depth_to_cloud(
             depth_m,
             self._camera,
-            stride=_STRIDE_PX,
+            stride=max(1, round(self._camera.width / _COLUMNS)),
             min_m=self._config.depth.min_m,
             max_m=min(self._config.depth.max_m, 5.0),
             max_jump=0.05,

@@ -45,6 +45,7 @@ log = logging.getLogger(__name__)
 
 _MAX_EXTRAPOLATION = 3.0  # frame intervals the constant velocity is believed for
 _RELOCALISATION_CANDIDATES = 4
+_START_KEYFRAMES = 5  # until so many, most points are known by a predicted depth only
 _RESCUE_STEP_M, _RESCUE_TURN_RAD = 0.1, 0.15  # between keyframes without features
 
 
@@ -249,7 +250,9 @@ class Tracker:
             return many or self._has_moved_on(placement, reference)
         if self._reference_overlap < tracking.min_inliers:
             return True  # the last keyframe saw too little to measure by
-        if still < tracking.keyframe_overlap * self._reference_overlap:
+        starting = len(self._map.keyframes) < _START_KEYFRAMES
+        enough = tracking.keyframe_overlap_start if starting else tracking.keyframe_overlap
+        if still < enough * self._reference_overlap:
             return True
         return placement.inliers < tracking.keyframe_min_inliers and still < 0.9 * self._reference_overlap
 

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""slamdepth as a system under test: its tracker, without files, mesh and report."""
+
+from __future__ import annotations
+
+from benchmarks.system import Estimate
+from slamdepth.config import Config
+from slamdepth.depth.registry import create_depth_model
+from slamdepth.pipeline.results import keyframe_trajectory
+from slamdepth.pipeline.run import seed_everything, seed_torch
+from slamdepth.tracker import create_tracker
+from slamdepth.types import Camera, Frame
+
+
+class SlamDepth:
+    """What ``slamdepth run --no-mesh`` does to each frame; the network runs live.
+
+    Raises:
+        WeightsError: the weights of the depth model are not there.
+    """
+
+    def __init__(self, camera: Camera, config: Config) -> None:
+        seed_everything(config.seed)
+        model = create_depth_model(config.depth.name, device=config.device, seed=config.seed)
+        seed_torch(config.seed)
+        self._tracker = create_tracker(camera, model, config)
+
+    def step(self, frame: Frame) -> None:
+        self._tracker.step(frame)
+
+    def finish(self) -> Estimate:
+        """The reconstruction's poses; errors as ``Tracker.finish``."""
+        done = self._tracker.finish()
+        counts = {
+            "keyframes": len(done.keyframes),
+            "loops": done.loop_closures,
+            "relocalisations": done.relocalisations,
+            "rescues": done.rescues,
+        }
+        keyframes = keyframe_trajectory(done) if done.keyframes else None
+        return Estimate(done.trajectory, keyframes, counts)

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rows of the table: which system, fed with what, under which settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks.system import System
+from slamdepth.config import Config, merge
+from slamdepth.errors import ConfigError
+from slamdepth.types import Camera
+
+SENSOR = "sensor"
+NONE = "none"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        label: what the table calls it; unique together with ``depth``.
+        system: key of :data:`SYSTEMS`.
+        depth: ``"sensor"``, ``"none"`` or a depth model's registered name.
+        settings: nested settings of slamdepth, over its defaults.
+        note: what a reader should know, or nothing.
+    """
+
+    label: str
+    system: str
+    depth: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    note: str = ""
+
+    @property
+    def is_ours(self) -> bool:
+        return self.system.startswith("slamdepth")
+
+    @property
+    def needs_sensor(self) -> bool:
+        return self.depth == SENSOR
+
+    @property
+    def needs_predictions(self) -> bool:
+        """Peers get predictions from the cache; slamdepth's network runs live."""
+        return not self.is_ours and self.depth not in (SENSOR, NONE)
+
+
+def _ours(depths: Sequence[str]) -> list[Row]:
+    return [Row("slamdepth", "slamdepth", depth) for depth in depths]
+
+
+def _ours_icp(depths: Sequence[str]) -> list[Row]:
+    return [Row("slamdepth, KISS-ICP", "slamdepth-icp", d, {"odometry": "kiss-icp"}) for d in depths]
+
+
+def _orbslam3(depths: Sequence[str]) -> list[Row]:
+    rows = [Row("ORB-SLAM3 monocular", "orbslam3", NONE, note="no scale of its own")]
+    for depth in depths:
+        note = "" if depth == SENSOR else "naive: predictions given as if a sensor's"
+        rows.append(Row("ORB-SLAM3 RGB-D", "orbslam3", depth, note=note))
+    return rows
+
+
+def _open3d(depths: Sequence[str]) -> list[Row]:
+    return [Row("Open3D RGB-D odometry", "open3d", depth) for depth in depths]
+
+
+def _kiss_icp(depths: Sequence[str]) -> list[Row]:
+    return [Row("KISS-ICP", "kiss-icp", depth) for depth in depths if depth == SENSOR]
+
+
+SYSTEMS: dict[str, Callable[[Sequence[str]], list[Row]]] = {
+    "slamdepth": _ours,
+    "slamdepth-icp": _ours_icp,
+    "orbslam3": _orbslam3,
+    "open3d": _open3d,
+    "kiss-icp": _kiss_icp,
+}
+"""Rows of each system for the depths asked for."""
+
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "as shipped": {},
+    "no loops": {"loops": {"enabled": False}},
+    "no final bundle": {"bundle": {"final": False}},
+    "no loops, no final bundle": {"loops": {"enabled": False}, "bundle": {"final": False}},
+    "window 4": {"bundle": {"window": 4}},
+    "no prior inflation": {"bundle": {"prior_inflation": 1.0}},
+    "prior inflation 5": {"bundle": {"prior_inflation": 5.0}},
+    "no common depth error": {"bundle": {"scale_sigma": 0.0}},
+    "any depth, however unsure": {"depth": {"max_sigma_log": 10.0}},
+    "500 features": {"features": {"count": 500}},
+    "1000 features": {"features": {"count": 1000}},
+    "2000 features": {"features": {"count": 2000}},
+    "keyframe overlap 0.5": {"tracking": {"keyframe_overlap": 0.5}},
+    "keyframe overlap 0.6": {"tracking": {"keyframe_overlap": 0.6}},
+    "keyframe overlap 0.7": {"tracking": {"keyframe_overlap": 0.7}},
+    "keyframe overlap 0.8": {"tracking": {"keyframe_overlap": 0.8}},
+    "keyframe overlap 0.9": {"tracking": {"keyframe_overlap": 0.9}},
+}
+"""Our own parts, one changed at a time: settings over the defaults."""
+
+
+def plan_rows(systems: Sequence[str], depths: Sequence[str]) -> list[Row]:
+    """The rows of ``systems`` for ``depths``, in the order given.
+
+    Raises:
+        ConfigError: no such system; lists those that exist.
+    """
+    rows: list[Row] = []
+    for name in systems:
+        if name not in SYSTEMS:
+            raise ConfigError(f"--systems: no system is called '{name}'; known: {', '.join(SYSTEMS)}")
+        rows += SYSTEMS[name](depths)
+    return rows
+
+
+def plan_ablation(depths: Sequence[str]) -> list[Row]:
+    """slamdepth with one part changed at a time; what is the default anyway is left out."""
+    rows = []
+    for depth in depths:
+        shipped, *others = (Row(label, "slamdepth", depth, s) for label, s in ABLATIONS.items())
+        rows += [shipped, *(row for row in others if config_of(row) != config_of(shipped))]
+    return rows
+
+
+def config_of(row: Row) -> Config:
+    """slamdepth's settings for a row.
+
+    Raises:
+        ConfigError: a setting of the row does not exist (any more) or is out of range.
+    """
+    return Config.from_dict(merge({"depth": {"name": row.depth}}, row.settings), origin=f"row '{row.label}'")
+
+
+def build_system(row: Row, camera: Camera, vocabulary: Path | None) -> System:
+    """The system of a row, ready for its first frame.
+
+    Raises:
+        NotInstalled: a peer's package is missing.
+        WeightsError: the weights of the depth model are missing.
+    """
+    if row.is_ours:
+        from benchmarks.ours import SlamDepth
+
+        return SlamDepth(camera, config_of(row))
+    if row.system == "orbslam3":
+        from benchmarks.orbslam3 import OrbSlam3
+
+        if vocabulary is None:
+            raise ConfigError("ORB-SLAM3 needs a vocabulary")
+        return OrbSlam3(camera, "mono" if row.depth == NONE else "rgbd", vocabulary)
+    from benchmarks import peers
+
+    return peers.Open3dOdometry(camera) if row.system == "open3d" else peers.KissIcp(camera)

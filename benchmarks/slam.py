@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SLAM systems side by side: same machine, same frames, same predicted depth.
+
+    python -m benchmarks.slam --data DIR --runs 5 --output slam.json
+
+See ``docs/benchmarks.md`` for how to read the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import logging
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks.jobs import Job, run_job
+from benchmarks.orbslam3 import HOW_TO_INSTALL
+from benchmarks.rows import ABLATIONS, NONE, SENSOR, SYSTEMS, Row, config_of, plan_ablation, plan_rows
+from benchmarks.summary import FORMAT, environment, read_benchmark, summarise
+from slamdepth.datasets import Dataset, open_dataset
+from slamdepth.errors import CameraError, ConfigError, DatasetError, SlamdepthError
+from slamdepth.io import write_json, write_text
+
+_BUSY = 0.5
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything a benchmark was asked for."""
+
+    sequences: dict[str, Dataset]
+    rows: list[Row]
+    runs: int
+    base: Job
+    cache: Path
+    vocabulary: Path | None
+    training_images: list[Path]
+    timeout_s: float
+
+
+def find_sequences(data: Path, names: Sequence[str] | None) -> dict[str, Dataset]:
+    """The named sequences below ``data``, or every folder there that is one.
+
+    Raises:
+        DatasetError: a named one cannot be opened, or there is none.
+    """
+    if names:
+        return {name: open_dataset(data / name) for name in names}
+    if not data.is_dir():
+        raise DatasetError(f"{data}: no such folder; --data names the folder that holds the sequences")
+    found = {}
+    for folder in sorted(path for path in data.iterdir() if path.is_dir()):
+        try:
+            found[folder.name] = open_dataset(folder)
+        except (DatasetError, CameraError):
+            continue
+    if not found:
+        raise DatasetError(f"{data}: holds no sequence; --data names the folder that holds the sequences")
+    return found
+
+
+def run_plan(plan: Plan) -> Iterator[dict[str, Any]]:
+    """Run everything, one process after another; yields the entries of the table."""
+    vocabulary: Path | None = None
+    for name, dataset in plan.sequences.items():
+        folders: dict[str, dict[str, Any]] = {}
+        for row in plan.rows:
+            trouble: dict[str, Any] | None = None
+            job = replace(plan.base, sequence=str(dataset.path.resolve()), row=row)
+            if row.needs_sensor and not dataset.has_depth:
+                trouble = {"status": "left out", "message": "the sequence has no sensor depth"}
+            elif row.system == "orbslam3":
+                trouble, vocabulary = _prepare_orbslam3(plan, vocabulary)
+                job = replace(job, vocabulary=str(vocabulary))
+            if trouble is None and row.needs_predictions:
+                if row.depth not in folders:
+                    tell(f"{name}: predicting depth with {row.depth} for the peers")
+                    folders[row.depth] = run_job(replace(job, kind="predict", cache=str(plan.cache)))
+                predicted = folders[row.depth]
+                trouble = None if predicted["status"] == "ok" else predicted
+                job = replace(job, depth_folder=predicted.get("folder"))
+            if trouble is not None:
+                yield summarise(name, row, [trouble])
+                continue
+            results = []
+            for number in range(plan.runs):
+                tell(f"{name}: {row.label} [{row.depth}], run {number + 1} of {plan.runs}")
+                results.append(run_job(job, timeout_s=plan.timeout_s))
+                if results[-1]["status"] == "not installed":
+                    break
+            yield summarise(name, row, results)
+
+
+def _prepare_orbslam3(plan: Plan, vocabulary: Path | None) -> tuple[dict[str, Any] | None, Path | None]:
+    """What keeps ORB-SLAM3 from running, if anything does, and its vocabulary, trained once."""
+    from importlib.util import find_spec
+
+    if find_spec("pyorbslam3") is None:
+        return {"status": "not installed", "message": HOW_TO_INSTALL}, None
+    vocabulary = vocabulary or plan.vocabulary
+    if vocabulary is None:
+        from benchmarks.orb_vocabulary import train_vocabulary_file
+
+        names = "\n".join(f"{path} {path.stat().st_size}" for path in plan.training_images)
+        digest = hashlib.sha256(names.encode()).hexdigest()[:12]
+        vocabulary = plan.cache / f"orb-vocabulary-{digest}.txt"
+        if not vocabulary.is_file():
+            tell(f"training an ORB vocabulary on {len(plan.training_images)} colour images")
+            train_vocabulary_file(plan.training_images, vocabulary)
+    return None, vocabulary
+
+
+def training_images(data: Path, sequences: Iterable[Dataset]) -> list[Path]:
+    """Images of ``data/depth_training/*/``, or where there are none every tenth of the sequences."""
+    found = sorted((data / "depth_training").glob("*/*.jpg"))
+    if found:
+        return found
+    for dataset in sequences:
+        images = sorted(p for p in dataset.path.rglob("*") if p.suffix.lower() in (".jpg", ".png"))
+        found += [path for path in images if "depth" not in path.relative_to(dataset.path).as_posix()][::10]
+    return found
+
+
+def tell(text: str) -> None:
+    """Progress, apart from the tables."""
+    print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.slam", description=(__doc__ or "").splitlines()[0]
+    )
+    add = parser.add_argument
+    add("--data", type=Path, required=True, help="folder that holds the sequences")
+    add("--sequences", type=_names, help="their names, with commas (default: all in --data)")
+    add("--systems", type=_names, default=list(SYSTEMS), help=f"with commas, of: {', '.join(SYSTEMS)}")
+    add("--depth", type=_names, default=[SENSOR, "dinov2"], help="'sensor' and names of depth models")
+    add("--runs", type=int, default=1, help="runs of each row; the table holds medians")
+    add("--ablation", action="store_true", help="instead: slamdepth with one part changed at a time")
+    add("--pace", choices=("sequence", "fast"), default="sequence",
+        help="give each frame at its time, or as fast as it is taken")  # fmt: skip
+    add("--max-frames", type=int)
+    add("--stride", type=int, default=1)
+    add("--output", type=Path, help=".json to write; tables (.md) and plot (.svg) go beside it")
+    add("--compare", type=Path, help=".json of an earlier benchmark: print what changed")
+    add("--vocabulary", type=Path, help="ORB-SLAM3's, DBoW2 text (default: trained here)")
+    add("--cache", type=Path, help="folder for predictions and vocabulary")
+    add("--timeout", type=float, default=1800.0, help="seconds after which a run is given up")
+    return parser.parse_args(arguments)
+
+
+def make_plan(options: argparse.Namespace) -> Plan:
+    """Check everything that can be checked before hours are spent.
+
+    Raises:
+        InputError: a sequence, a system or a depth does not exist.
+    """
+    from platformdirs import user_cache_dir
+
+    from slamdepth.depth.registry import depth_model_names
+
+    for depth in options.depth:
+        if depth not in depth_model_names():
+            raise ConfigError(
+                f"--depth: no depth is called '{depth}'; known: {', '.join(depth_model_names())}"
+            )
+    if options.runs < 1:
+        raise ConfigError(f"--runs: at least 1, got {options.runs}")
+    rows = plan_ablation(options.depth) if options.ablation else plan_rows(options.systems, options.depth)
+    for row in rows:
+        if row.is_ours:
+            config_of(row)
+    if options.vocabulary and not options.vocabulary.is_file():
+        raise ConfigError(f"{options.vocabulary}: no such vocabulary file")
+    sequences = find_sequences(options.data, options.sequences)
+    base = Job("", Row("", "", NONE), pace=options.pace, stride=options.stride, max_frames=options.max_frames)
+    base.indices(1)
+    return Plan(
+        sequences,
+        rows,
+        options.runs,
+        base,
+        (options.cache or Path(user_cache_dir("slamdepth")) / "benchmarks").resolve(),
+        options.vocabulary and options.vocabulary.resolve(),
+        training_images(options.data, sequences.values()),
+        options.timeout,
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    options = parse(arguments)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    try:
+        earlier = read_benchmark(options.compare) if options.compare else None
+        plan = make_plan(options)
+        begun = environment()
+        if begun["load_average"] is not None and begun["load_average"] > _BUSY:
+            tell(f"the machine is busy (load {begun['load_average']:.1f}): speeds will suffer")
+        rows: list[dict[str, Any]] = []
+        benchmark = {
+            "format": FORMAT,
+            "environment": begun,
+            "settings": {
+                "runs": plan.runs,
+                "pace": plan.base.pace,
+                "stride": plan.base.stride,
+                "max_frames": plan.base.max_frames,
+                "vocabulary": "given" if plan.vocabulary else "trained",
+                "ablations": ABLATIONS if options.ablation else {},
+            },
+            "rows": rows,
+        }
+        code = 0
+        try:
+            for row in run_plan(plan):
+                rows.append(row)
+                if options.output:
+                    write_json(options.output, benchmark)  # what is done is kept, whatever comes
+        except KeyboardInterrupt:
+            tell("interrupted; the table holds what was done")
+            code = 130
+        _publish(benchmark, earlier, options.output)
+    except SlamdepthError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    return code
+
+
+def _publish(benchmark: dict[str, Any], earlier: dict[str, Any] | None, output: Path | None) -> None:
+    from rich.console import Console
+
+    from benchmarks import tables
+    from benchmarks.plot import write_plot
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=200)
+    if output:
+        write_json(output, benchmark)
+        write_text(output.with_suffix(".md"), tables.markdown(benchmark))
+        write_plot(output.with_suffix(".svg"), benchmark)
+    for table in tables.rich_tables(benchmark):
+        console.print(table)
+    if earlier:
+        console.print(tables.comparison_table(earlier, benchmark))
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in (part.strip() for part in text.split(",")) if name]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

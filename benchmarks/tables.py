@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables: for a terminal, for a document, and the change against an earlier benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.summary import METRICS, Metric
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+MISSING = "-"
+_NOISE = 0.02  # relative changes below this are not marked
+
+
+def cell(metric: Metric, figures: Mapping[str, Mapping[str, float]]) -> str:
+    """Median and, where runs differ, half of what lies between the extremes."""
+    value = figures.get(metric.key)
+    if value is None:
+        return MISSING
+    text = f"{value['median'] * metric.factor:.{metric.digits}f}"
+    half = (value["max"] - value["min"]) / 2 * metric.factor
+    return f"{text} ±{half:.{metric.digits}f}" if round(half, metric.digits) > 0 else text
+
+
+def by_sequence(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """The rows of each sequence, in order."""
+    grouped: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        grouped.setdefault(row["sequence"], []).append(row)
+    return grouped
+
+
+def rich_tables(benchmark: Mapping[str, Any]) -> list[Table]:
+    """A table a sequence, notes beneath."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    tables = []
+    for sequence, rows in by_sequence(benchmark["rows"]).items():
+        shown = [metric for metric in METRICS if any(metric.key in row["figures"] for row in rows)]
+        notes = [f"{_name(row)}: {note}" for row in rows for note in row["notes"]]
+        table = Table(
+            title=Text(sequence, style="bold"),
+            title_justify="left",
+            box=box.SIMPLE,
+            caption=Text("\n".join(notes)),
+            caption_justify="left",
+        )
+        table.add_column("system", no_wrap=True)
+        table.add_column("depth")
+        for metric in shown:
+            table.add_column(metric.heading, justify="right")
+        for row in rows:
+            values = [cell(metric, row["figures"]) for metric in shown]
+            label = row["label"] if row["status"] == "ok" else f"{row['label']}: {_trouble(row)}"
+            table.add_row(Text(label), row["depth"], *values)
+        tables.append(table)
+    return tables
+
+
+def markdown(benchmark: Mapping[str, Any]) -> str:
+    """The same tables for ``docs/benchmarks.md``."""
+    parts = []
+    for sequence, rows in by_sequence(benchmark["rows"]).items():
+        shown = [metric for metric in METRICS if any(metric.key in row["figures"] for row in rows)]
+        lines = [f"### {sequence}", ""]
+        lines.append("| system | depth | " + " | ".join(metric.heading for metric in shown) + " |")
+        lines.append("| --- " * (2 + len(shown)) + "|")
+        for row in rows:
+            label = row["label"] if row["status"] == "ok" else f"{row['label']}: {_trouble(row)}"
+            cells = [label, row["depth"], *(cell(metric, row["figures"]) for metric in shown)]
+            lines.append("| " + " | ".join(text.replace("|", "\\|") for text in cells) + " |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, str, str, float, float, int]]:
+    """What moved between two benchmarks.
+
+    Returns:
+        Sequence, row, key, old and new median, and 1 for better, -1 for worse, 0 for neither
+        or within 2 %, for every row and figure that both have.
+    """
+    before = {_key(row): row for row in old["rows"]}
+    found = []
+    for row in new["rows"]:
+        earlier = before.get(_key(row))
+        for metric in METRICS:
+            if earlier is None or metric.key not in earlier["figures"] or metric.key not in row["figures"]:
+                continue
+            was = float(earlier["figures"][metric.key]["median"])
+            now = float(row["figures"][metric.key]["median"])
+            moved = abs(now - was) > _NOISE * max(abs(was), 1e-12)
+            verdict = metric.better * (1 if now > was else -1) if moved else 0
+            found.append((row["sequence"], _name(row), metric.key, was, now, verdict))
+    return found
+
+
+def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> Table:
+    """Old and new medians side by side; a warning where machine or settings differ."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    metrics = {metric.key: metric for metric in METRICS}
+    commit = str(old["environment"]["versions"].get("commit"))[:10]
+    differing = [
+        name
+        for name, differs in (
+            ("hardware", old["environment"]["hardware"] != new["environment"]["hardware"]),
+            ("settings", old["settings"] != new["settings"]),
+        )
+        if differs
+    ]
+    warning = f"not the same {' and '.join(differing)} as then" if differing else ""
+    title = Text(f"change against {commit}", style="bold")
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, caption=warning, caption_justify="left")
+    for name in ("sequence", "system", "figure"):
+        table.add_column(name)
+    for name in ("then", "now", "change"):
+        table.add_column(name, justify="right")
+    for sequence, name, key, was, now, verdict in changes(old, new):
+        metric = metrics[key]
+        change = f"{100 * (now - was) / was:+.0f} %" if was else MISSING
+        style = {1: "green", -1: "red", 0: ""}[verdict]
+        shown = [f"{value * metric.factor:.{metric.digits}f}" for value in (was, now)]
+        table.add_row(sequence, Text(name), metric.heading, *shown, Text(change, style=style))
+    return table
+
+
+def _key(row: Mapping[str, Any]) -> tuple[str, str, str]:
+    return row["sequence"], row["label"], row["depth"]
+
+
+def _name(row: Mapping[str, Any]) -> str:
+    return f"{row['label']} [{row['depth']}]"
+
+
+def _trouble(row: Mapping[str, Any]) -> str:
+    message = str(row["message"])
+    return message if message.startswith(str(row["status"])) else f"{row['status']}: {message}"

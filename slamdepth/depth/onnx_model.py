@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Any depth network as an ONNX file, run by ONNX Runtime (an optional dependency).
+
+Nothing in an ONNX graph says what its numbers mean, so the file must: by the entry
+``slamdepth`` of its metadata, or by a text file beside it called ``FILE.onnx.json``, both a
+JSON object with
+
+    kind         "metric depth", "affine depth" or "affine inverse depth"; needed
+    input_size   [rows, columns] the network was trained on; needed where the graph leaves it open
+    multiple     where the graph leaves the size open, sides are multiples of this (14)
+    focal_px     focal length of the training images at that size; metric depth only
+    mean, std    of the input in 0..1, three numbers each (ImageNet's)
+    licence, trained_on
+
+The graph takes one image ``(1, 3, rows, columns)``, RGB, and its first output is the map.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from slamdepth.depth import weights as store
+from slamdepth.depth.card import ModelCard
+from slamdepth.depth.network import NetworkDepth
+from slamdepth.depth.preprocess import resize_rgb
+from slamdepth.errors import ConfigError, WeightsError
+from slamdepth.types import DepthKind, WeightsInfo
+
+METADATA_KEY = "slamdepth"
+_KINDS = ", ".join(f'"{kind.value}"' for kind in DepthKind)
+
+Three = tuple[float, float, float]
+
+
+class OnnxAbout(BaseModel):
+    """What the author of an ONNX file says of it; see the module."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: DepthKind
+    input_size: tuple[int, int] | None = None
+    multiple: int = Field(14, ge=1)
+    focal_px: float | None = Field(None, gt=0, allow_inf_nan=False)
+    mean: Three = (0.485, 0.456, 0.406)
+    std: Three = (0.229, 0.224, 0.225)
+    licence: str = "unknown"
+    trained_on: str = "unknown"
+
+
+class OnnxDepth(NetworkDepth):
+    """A depth network in an ONNX file.
+
+    Args:
+        session: an ONNX Runtime session.
+        about: what the file says of itself.
+        size: rows and columns of the input; where ``is_fixed`` exactly these, else an
+            input of about their area in the image's aspect.
+        card, weights, device: see :class:`NetworkDepth`.
+    """
+
+    def __init__(
+        self,
+        session: Any,
+        about: OnnxAbout,
+        card: ModelCard,
+        weights: tuple[WeightsInfo, ...],
+        device: str = "cpu",
+        *,
+        is_fixed: bool = True,
+    ) -> None:
+        super().__init__(card, weights, device)
+        self._session = session
+        self._about = about
+        self._is_fixed = is_fixed
+        self._input = session.get_inputs()[0].name
+        self._output = session.get_outputs()[0].name
+
+    @classmethod
+    def load(cls, path: Path, *, device: str = "cpu") -> OnnxDepth:
+        """Open an ONNX file.
+
+        Raises:
+            WeightsError: the file is missing or unreadable, does not say what its numbers
+                mean, or takes another input.
+            ConfigError: ONNX Runtime is not installed, or lacks the device.
+        """
+        if not path.is_file():
+            raise WeightsError(f"{path}: no such ONNX file")
+        session = _open(path, device)
+        about = _about(path, session.get_modelmeta().custom_metadata_map)
+        size, is_fixed = _input_size(path, session, about)
+        card = ModelCard(f"onnx:{path}", about.kind, size, about.focal_px, about.licence, about.trained_on)
+        info = WeightsInfo(path.stem, store.sha256_of(path), about.trained_on, about.licence)
+        return cls(session, about, card, (info,), device, is_fixed=is_fixed)
+
+    def infer(self, image_rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], tuple[int, int]]:
+        import cv2
+
+        height, width = image_rgb.shape[:2]
+        rows, columns = self.card.native_size
+        if not self._is_fixed:
+            scale = math.sqrt(rows * columns / (height * width))
+            multiple = self._about.multiple
+            rows, columns = (max(1, round(side * scale / multiple)) * multiple for side in (height, width))
+        image = resize_rgb(image_rgb, rows, columns).astype(np.float32) / 255.0
+        mean: NDArray[np.float32] = np.array(self._about.mean, dtype=np.float32)
+        std: NDArray[np.float32] = np.array(self._about.std, dtype=np.float32)
+        image = (image - mean) / std
+        image = np.ascontiguousarray(image.transpose(2, 0, 1)[None])
+        out = np.asarray(self._session.run([self._output], {self._input: image})[0], dtype=np.float32)
+        if out.ndim < 2 or out.size != out.shape[-2] * out.shape[-1]:
+            raise WeightsError(
+                f"{self.name}: the first output is {out.shape}, not one map (1, 1, rows, columns)"
+            )
+        out = out.reshape(out.shape[-2:])
+        values = cv2.resize(out, (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(values, dtype=np.float32), (rows, columns)
+
+
+def _open(path: Path, device: str) -> Any:
+    try:
+        onnxruntime = importlib.import_module("onnxruntime")
+    except ImportError as error:
+        raise ConfigError(
+            "depth by an ONNX file needs ONNX Runtime: install it with pip install 'slamdepth[onnx]'"
+        ) from error
+    provider = "CUDAExecutionProvider" if device.startswith("cuda") else "CPUExecutionProvider"
+    if provider not in onnxruntime.get_available_providers():
+        raise ConfigError(
+            f"device '{device}': this ONNX Runtime has no {provider}; use 'cpu' or onnxruntime-gpu"
+        )
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=[provider])
+    except Exception as error:  # ONNX Runtime's errors share no base class of their own
+        first_line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise WeightsError(f"{path}: not a readable ONNX file: {first_line}") from error
+
+
+def _about(path: Path, metadata: dict[str, str]) -> OnnxAbout:
+    beside = path.with_name(path.name + ".json")
+    origin = str(beside) if beside.is_file() else f"{path}, metadata '{METADATA_KEY}'"
+    try:
+        text = beside.read_text(encoding="utf-8") if beside.is_file() else metadata.get(METADATA_KEY)
+        if text is None:
+            raise WeightsError(
+                f"{path}: does not say what its numbers mean; write {beside} with at least "
+                f'{{"kind": K}}, K being one of {_KINDS}'
+            )
+        return OnnxAbout.model_validate(json.loads(text))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the whole"
+        raise WeightsError(f"{origin}: {where}: {first['msg']}") from error
+    except (OSError, ValueError) as error:
+        raise WeightsError(f"{origin}: not readable as JSON: {error}") from error
+
+
+def _input_size(path: Path, session: Any, about: OnnxAbout) -> tuple[tuple[int, int], bool]:
+    """Rows and columns of the input, and whether the graph fixes them."""
+    inputs = session.get_inputs()
+    shape = list(inputs[0].shape) if inputs else []
+    if len(inputs) != 1 or len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != 3):
+        raise WeightsError(
+            f"{path}: takes {[(i.name, i.shape) for i in inputs]}, not one image (1, 3, rows, columns)"
+        )
+    if inputs[0].type != "tensor(float)":
+        raise WeightsError(f"{path}: takes {inputs[0].type}, not tensor(float)")
+    if all(isinstance(side, int) and side > 0 for side in shape[2:]):
+        return (shape[2], shape[3]), True
+    if about.input_size is None:
+        raise WeightsError(f"{path}: leaves its input size open; say 'input_size' [rows, columns]")
+    return about.input_size, False
+
+
+def create(path: str, *, device: str = "cpu", seed: int = 0) -> OnnxDepth:
+    """The model in the file at ``path``."""
+    del seed
+    return OnnxDepth.load(Path(path), device=device)
