@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -279,4 +279,3 @@ class Reconstruction:
     rescues: int
     timings_ms: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    extra: dict[str, Any] = field(default_factory=dict)

@@ -138,12 +138,7 @@ class Dinov2Mlp(NetworkDepth):
         backbone_file = store.find_backbone(backbone)
         card = model_card(about)
         infos = (
-            WeightsInfo(
-                store.BACKBONE,
-                store.verify(backbone_file),
-                store.BACKBONE_TRAINED_ON,
-                store.BACKBONE_LICENCE,
-            ),
+            store.backbone_info(backbone_file),
             WeightsInfo(path.stem, store.sha256_of(path), card.trained_on, card.licence),
         )
         return cls(load_dinov2(backbone_file, device), head, card, infos, device)

@@ -107,12 +107,7 @@ class Dinov2OfficialDepth(NetworkDepth):
         network = load_strictly(partial(_build, head, data, tensors), tensors, str(path), device=device)
         backbone_file = store.find_backbone(backbone)
         infos = (
-            WeightsInfo(
-                store.BACKBONE,
-                store.verify(backbone_file),
-                store.BACKBONE_TRAINED_ON,
-                store.BACKBONE_LICENCE,
-            ),
+            store.backbone_info(backbone_file),
             WeightsInfo(path.stem, store.sha256_of(path), card.trained_on, card.licence),
         )
         return cls(load_dinov2(backbone_file, device), network, card, infos, device)

@@ -61,10 +61,10 @@ class Dinov2Depth:
             raise ConfigError(f"device '{device}': no CUDA device is available; use 'cpu'")
         head_file = head or store.head_path()
         backbone_file = store.find_backbone(backbone)
-        backbone_sha256 = store.verify(backbone_file)
+        backbone_info = store.backbone_info(backbone_file)
         network, about = load_head(head_file, device)
         infos = (
-            WeightsInfo(store.BACKBONE, backbone_sha256, store.BACKBONE_TRAINED_ON, store.BACKBONE_LICENCE),
+            backbone_info,
             WeightsInfo(
                 head_file.stem,
                 store.sha256_of(head_file),

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from slamdepth.depth.layout import pack_about, unpack_about
 from slamdepth.errors import WeightsError
+from slamdepth.types import WeightsInfo
 
 logger = logging.getLogger(__name__)
 
@@ -81,6 +82,11 @@ def sha256_of(path: Path) -> str:
         while chunk := file.read(1 << 20):
             digest.update(chunk)
     return digest.hexdigest()
+
+
+def backbone_info(path: Path) -> WeightsInfo:
+    """What a report says of the backbone file at ``path``, which is verified; errors of :func:`verify`."""
+    return WeightsInfo(BACKBONE, verify(path), BACKBONE_TRAINED_ON, BACKBONE_LICENCE)
 
 
 def list_weights() -> list[WeightsEntry]:

@@ -1,11 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every tracker asks of a frame."""
+"""What every tracker asks of a frame and of a depth model."""
 
 from __future__ import annotations
 
+from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
+from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import CameraError, ConfigError, TrackingError
 from slamdepth.types import Camera, DepthKind, Frame
+
+
+def model_for(depth_model: DepthModel | None, config: Config) -> DepthModel:
+    """The model given, or else the one that ``config.depth.name`` names.
+
+    Raises:
+        ConfigError: no model has that name, or its predictions are relative.
+        WeightsError: its weights are not there.
+    """
+    model = depth_model or create_depth_model(config.depth.name, device=config.device, seed=config.seed)
+    check_model(model)
+    return model
 
 
 def check_model(model: DepthModel) -> None:

@@ -11,11 +11,10 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
-from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.registration import CloudOdometry, CloudOdometryConfig, depth_to_cloud
 from slamdepth.geometry import invert, project, transform
-from slamdepth.tracker.checks import check_frame, check_model
+from slamdepth.tracker.checks import check_frame, model_for
 from slamdepth.tracker.threads import one_blas_thread
 from slamdepth.types import (
     Camera,
@@ -51,10 +50,7 @@ class CloudTracker:
     ) -> None:
         self.camera = camera
         self.config = config or Config()
-        self._depth_model = depth_model or create_depth_model(
-            self.config.depth.name, device=self.config.device, seed=self.config.seed
-        )
-        check_model(self._depth_model)
+        self._depth_model = model_for(depth_model, self.config)
         reach = CloudOdometryConfig(
             min_m=max(self.config.depth.min_m, 0.2), max_m=min(self.config.depth.max_m, 5.0)
         )

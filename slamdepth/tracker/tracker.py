@@ -14,12 +14,11 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
-from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.features import Features, create_extractor
 from slamdepth.geometry import invert, rotation_angle_rad, so3_exp, so3_log
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
-from slamdepth.tracker.checks import check_frame, check_model
+from slamdepth.tracker.checks import check_frame, model_for
 from slamdepth.tracker.finish import build_reconstruction, optimise_everything
 from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
@@ -74,10 +73,7 @@ class Tracker:
     ) -> None:
         self.camera = camera
         self.config = config or Config()
-        self._depth_model = depth_model or create_depth_model(
-            self.config.depth.name, device=self.config.device, seed=self.config.seed
-        )
-        check_model(self._depth_model)
+        self._depth_model = model_for(depth_model, self.config)
         self._extractor = create_extractor(self.config.features)
         self._map = LandmarkMap()
         self._localiser = Localiser(camera, self.config, self._map)
