@@ -60,7 +60,11 @@ class MadeUpTracker:
         self.lost, self.on_step = lost, on_step or (lambda frame: None)
         self.seen: list[int] = []
 
-    def step(self, frame: Frame) -> StepResult:
+    def prepare(self, frame: Frame) -> int:
+        return frame.index
+
+    def step(self, frame: Frame, prepared: int | None = None) -> StepResult:
+        assert prepared in (None, frame.index)
         self.on_step(frame)
         self.seen.append(frame.index)
         is_lost = frame.index in self.lost

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slamdepth.backend import bundle
-from slamdepth.backend.bundle import HUBER, BundleProblem, bundle_adjust
+from slamdepth.backend import bundle_solver
+from slamdepth.backend.bundle import BundleProblem, bundle_adjust
+from slamdepth.backend.bundle_solver import HUBER
 from slamdepth.geometry import invert, project, rotation_angle_rad, se3_exp, transform
 from slamdepth.types import Camera
 
@@ -214,7 +215,7 @@ def test_a_wild_depth_is_outvoted() -> None:
 def test_sparse_and_dense_eliminations_agree(monkeypatch: pytest.MonkeyPatch, sigma_scale: float) -> None:
     problem = noisy(disturbed(replace(truth(), sigma_scale=sigma_scale)), 0.5)
     dense = bundle_adjust(problem)
-    monkeypatch.setattr(bundle, "_DENSE_LIMIT", 0)
+    monkeypatch.setattr(bundle_solver, "_DENSE_LIMIT", 0)
     sparse = bundle_adjust(problem)
     np.testing.assert_allclose(sparse.T_camera_world, dense.T_camera_world, atol=1e-9)
     np.testing.assert_allclose(sparse.points_w, dense.points_w, atol=1e-8)

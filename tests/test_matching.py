@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slamdepth.frontend.matching import best_matches, hamming, hamming_table, match_all, pairs_within
+from slamdepth.frontend.matching import PixelGrid, best_matches, hamming, hamming_table, match_all
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -42,7 +42,7 @@ def test_pairs_within_is_brute_force(seed: int, m: int, n: int, reach: float) ->
     rng = np.random.default_rng(seed)
     query, px = rng.uniform(-60, 60, (m, 2)), rng.uniform(-40, 50, (n, 2))
     radius = rng.uniform(0.5, 1, m) * reach
-    q, t = pairs_within(query, radius, px)
+    q, t = PixelGrid(px).pairs_within(query, radius)
     assert q.shape == t.shape
     found = set(zip(q.tolist(), t.tolist(), strict=True))
     assert len(found) == len(q), "a pair came twice"
@@ -53,20 +53,22 @@ def test_pairs_within_is_brute_force(seed: int, m: int, n: int, reach: float) ->
 def test_pairs_within_takes_the_rim_and_mixed_radii() -> None:
     px = np.array([[0.0, 0.0], [12.0, 0.0], [30.0, 0.0], [31.0, 0.0], [500.0, 0.0]])
     query = np.zeros((4, 2))
-    q, t = pairs_within(query, np.array([12.0, 12.1, 30.0, 1000.0]), px)
+    q, t = PixelGrid(px).pairs_within(query, np.array([12.0, 12.1, 30.0, 1000.0]))
     assert [sorted(t[q == i].tolist()) for i in range(4)] == [[0, 1], [0, 1], [0, 1, 2], [0, 1, 2, 3, 4]]
 
 
 def test_pairs_within_nothing() -> None:
     for query, px in ((np.zeros((0, 2)), np.ones((3, 2))), (np.ones((3, 2)), np.zeros((0, 2)))):
-        q, t = pairs_within(query, np.full(len(query), 5.0), px)
+        q, t = PixelGrid(px).pairs_within(query, np.full(len(query), 5.0))
         assert len(q) == len(t) == 0
-    q, _ = pairs_within(np.full((1, 2), 1e6), np.array([5.0]), np.ones((3, 2)))
+    q, _ = PixelGrid(np.ones((3, 2))).pairs_within(np.full((1, 2), 1e6), np.array([5.0]))
     assert len(q) == 0
 
 
 def test_small_radii_over_a_large_image_need_no_large_grid() -> None:
-    q, t = pairs_within(np.array([[5.0, 5.0]]), np.array([1e-4]), np.array([[5.0, 5.0], [4000.0, 3000.0]]))
+    q, t = PixelGrid(np.array([[5.0, 5.0], [4000.0, 3000.0]])).pairs_within(
+        np.array([[5.0, 5.0]]), np.array([1e-4])
+    )
     assert (q.tolist(), t.tolist()) == ([0], [0])
 
 

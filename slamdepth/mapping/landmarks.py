@@ -155,14 +155,15 @@ class LandmarkMap:
             return
         target = np.arange(self.size)
         target[losers] = winners
+        is_loser = np.zeros(self.size + 1, dtype=bool)
+        is_loser[losers] = True  # and never the last, which stands for -1
         for keyframe in self.keyframes:
             ids = keyframe.point_ids
-            at = np.flatnonzero(ids >= 0)
-            moved = at[target[ids[at]] != ids[at]]
+            moved = np.flatnonzero(is_loser[ids])
             if len(moved) == 0:
                 continue
-            taken = np.zeros(self.size, dtype=bool)
-            taken[ids[at]] = True
+            taken = np.zeros(self.size + 1, dtype=bool)
+            taken[ids] = True
             for feature in moved:
                 winner = target[ids[feature]]
                 if taken[winner]:
@@ -181,12 +182,10 @@ class LandmarkMap:
         if len(rows) == 0:
             return
         self.alive[rows] = False
-        dead = np.zeros(self.size, dtype=bool)
+        dead = np.zeros(self.size + 1, dtype=bool)
         dead[rows] = True
         for keyframe in self.keyframes:
-            ids = keyframe.point_ids
-            seen = ids >= 0
-            ids[seen & dead[np.where(seen, ids, 0)]] = -1
+            keyframe.point_ids[dead[keyframe.point_ids]] = -1
 
     def drop_observations(self, keyframe_index: Ints, feature: Ints) -> None:
         """Forget single observations; points left with none die."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames read ahead in a thread, in order, so that decoding does not wait for tracking."""
+"""Frames read and prepared ahead in a thread, in order, so that neither waits for tracking."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from types import TracebackType
+from typing import Any
 
 from slamdepth.datasets import Dataset
 from slamdepth.errors import ImageDecodeError
@@ -17,6 +19,14 @@ from slamdepth.types import Frame
 logger = logging.getLogger(__name__)
 
 _POLL_S = 0.1
+
+
+@dataclass(frozen=True)
+class ReadFrame:
+    """A frame, and what ``prepare`` gave for it."""
+
+    frame: Frame
+    prepared: Any = None
 
 
 class FramePrefetcher:
@@ -29,16 +39,24 @@ class FramePrefetcher:
         indices: which frames, in the order they come out.
         with_depth: also read the sensor depth; None where a frame has none or it does not
             decode.
+        prepare: called with each frame, in the thread.
         capacity: frames read ahead.
     """
 
     def __init__(
-        self, dataset: Dataset, indices: Sequence[int], *, with_depth: bool, capacity: int = 4
+        self,
+        dataset: Dataset,
+        indices: Sequence[int],
+        *,
+        with_depth: bool,
+        prepare: Callable[[Frame], Any] | None = None,
+        capacity: int = 4,
     ) -> None:
         self._dataset = dataset
         self._indices = indices
         self._with_depth = with_depth
-        self._queue: queue.Queue[Frame | Exception | None] = queue.Queue(maxsize=capacity)
+        self._prepare = prepare
+        self._queue: queue.Queue[ReadFrame | Exception | None] = queue.Queue(maxsize=capacity)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._read_all, name="slamdepth-reader", daemon=True)
         self.read_s = 0.0
@@ -54,7 +72,7 @@ class FramePrefetcher:
         self._closed.set()
         self._thread.join()
 
-    def __iter__(self) -> Iterator[Frame | ImageDecodeError]:
+    def __iter__(self) -> Iterator[ReadFrame | ImageDecodeError]:
         """Each frame, or the error of an image that does not decode.
 
         Raises:
@@ -69,10 +87,13 @@ class FramePrefetcher:
         for index in self._indices:
             start = time.perf_counter()
             try:
-                item: Frame | Exception = self._read(index)
+                frame = self._read(index)
+                self.read_s += time.perf_counter() - start
+                item: ReadFrame | Exception = ReadFrame(
+                    frame, None if self._prepare is None else self._prepare(frame)
+                )
             except Exception as error:  # handed to the thread that iterates, which raises it
                 item = error
-            self.read_s += time.perf_counter() - start
             if not self._put(item):
                 return
         self._put(None)
@@ -88,7 +109,7 @@ class FramePrefetcher:
             logger.warning("depth of frame %d left out: %s", index, error)
         return frame
 
-    def _put(self, item: Frame | Exception | None) -> bool:
+    def _put(self, item: ReadFrame | Exception | None) -> bool:
         while not self._closed.is_set():
             try:
                 self._queue.put(item, timeout=_POLL_S)

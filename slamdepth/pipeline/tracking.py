@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from slamdepth.datasets import Dataset
 from slamdepth.errors import DatasetError, ImageDecodeError
@@ -26,7 +26,9 @@ _WARNINGS = 5  # images named one by one before only their number is told
 class AnyTracker(Protocol):
     """What the pipeline needs of a tracker."""
 
-    def step(self, frame: Frame) -> StepResult: ...
+    def prepare(self, frame: Frame) -> Any: ...
+
+    def step(self, frame: Frame, prepared: Any = None) -> StepResult: ...
 
     def finish(self) -> Reconstruction: ...
 
@@ -72,7 +74,7 @@ def track(
     skipped = 0
     start_s: float | None = None
     total = len(indices)
-    reader = FramePrefetcher(dataset, indices, with_depth=with_depth)
+    reader = FramePrefetcher(dataset, indices, with_depth=with_depth, prepare=tracker.prepare)
     progress(RunProgress(Stage.TRACKING, 0, total))
     with reader, TrajectoryWriter(online_path) as online:
         for item in reader:
@@ -89,7 +91,7 @@ def track(
                 continue
             if start_s is None:
                 start_s = time.perf_counter()
-            result = tracker.step(item)
+            result = tracker.step(item.frame, item.prepared)
             steps.append(result)
             if result.T_world_camera is not None:
                 online.append(result.timestamp_s, result.T_world_camera)

@@ -64,7 +64,10 @@ class CloudTracker:
         self._finished = False
         self._totals: dict[str, list[float]] = defaultdict(list)
 
-    def step(self, frame: Frame) -> StepResult:
+    def prepare(self, frame: Frame) -> None:
+        """Nothing can be found out ahead: see ``Tracker.prepare``."""
+
+    def step(self, frame: Frame, prepared: None = None) -> StepResult:
         """Place the next frame; arguments, result and errors as for ``Tracker.step``."""
         check_frame(frame, self.camera, self._last_time_s, self._finished)
         self._last_time_s = frame.timestamp_s

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import logging
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -106,7 +108,7 @@ def build_reconstruction(
     good = landmarks.alive[: landmarks.size] & (landmarks.observations[: landmarks.size] >= 2)
     return Reconstruction(
         trajectory=frames.trajectory(),
-        keyframes=tuple(_final(k, mapper) for k in landmarks.keyframes),
+        keyframes=_final_keyframes(landmarks, mapper),
         points_m=landmarks.position_w[: landmarks.size][good],
         frames=frames_total,
         tracked=len(frames),
@@ -116,6 +118,12 @@ def build_reconstruction(
         timings_ms=timings_ms,
         notes=tuple(notes),
     )
+
+
+def _final_keyframes(landmarks: LandmarkMap, mapper: LocalMapper) -> tuple[Keyframe, ...]:
+    """Depth images are large and independent: NumPy works on several at once."""
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        return tuple(pool.map(lambda keyframe: _final(keyframe, mapper), landmarks.keyframes))
 
 
 def _final(keyframe: MapKeyframe, mapper: LocalMapper) -> Keyframe:

@@ -44,9 +44,8 @@ class LocalMapper:
         features: Features,
         T_camera_world: Floats,
         point_ids: Ints,
-        prediction: DepthPrediction,
     ) -> MapKeyframe:
-        """Make ``frame`` a keyframe of the map and give birth to the points it sees anew."""
+        """Make ``frame`` a keyframe of the map with the points it knows; its depth comes later."""
         keyframe = MapKeyframe(
             id=len(self._map.keyframes),
             frame=frame,
@@ -55,10 +54,8 @@ class LocalMapper:
             point_ids=point_ids.copy(),
             log_depth=np.full(len(features), np.nan),
             sigma_log=np.full(len(features), np.nan),
-            prediction=_compact(prediction),
         )
         self._map.add_keyframe(keyframe)
-        self._give_birth(keyframe, prediction)
         return keyframe
 
     def count_births(self, features: Features, prediction: DepthPrediction) -> int:
@@ -72,7 +69,9 @@ class LocalMapper:
         in_range = (log_depth > np.log(config.min_m)) & (log_depth < np.log(config.max_m))
         return in_range & (sigma_log < config.max_sigma_log)
 
-    def _give_birth(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
+    def give_birth(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
+        """Give a keyframe its depth, and birth to the points it sees anew."""
+        keyframe.prediction = _compact(prediction)
         features = keyframe.features
         depth, sigma = log_depth_at(prediction, features.raw_px)
         sure = sigma < self._config.depth.max_sigma_log
@@ -195,7 +194,8 @@ class LocalMapper:
         if not is_fixed.any():
             is_fixed[0] = True  # nothing outside holds the window: its oldest keyframe does
         gather = [(k.features, k, at) for k, at in zip(keyframes, feats, strict=True)]
-        is_sensor = keyframes[0].prediction is not None and keyframes[0].prediction.is_sensor
+        first = landmarks.keyframes[0].prediction
+        is_sensor = first is not None and first.is_sensor
         problem = BundleProblem(
             camera=self._camera,
             T_camera_world=np.stack([k.T_camera_world for k in keyframes]),

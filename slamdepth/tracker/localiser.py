@@ -10,7 +10,7 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
-from slamdepth.frontend.matching import best_matches, hamming, match_all, pairs_within
+from slamdepth.frontend.matching import best_matches, hamming, match_all
 from slamdepth.frontend.pose import pixel_covariance, pose_from_scratch, refine_pose
 from slamdepth.geometry import project, transform
 from slamdepth.mapping.landmarks import LandmarkMap
@@ -115,7 +115,7 @@ class Localiser:
             np.maximum(half_trace**2 - (S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2), 0.0)
         )
         reach = np.minimum(radius_px * octave_scale + sigmas * np.sqrt(largest), max_px)
-        q, t = pairs_within(visible.px, reach, features.px)
+        q, t = features.grid.pairs_within(visible.px, reach)
         step = features.octave[t] - visible.octave[q]
         ok = (step >= -1) & (step <= 1)
         q, t = q[ok], t[ok]
@@ -154,7 +154,7 @@ class Localiser:
             found, at, _ = self.search(visible, features, radius, max(40.0, 1.5 * radius))
             if len(found) < need:
                 continue
-            placement = self._solve(features, T_guess, found, at)
+            placement = self._solve(features, T_guess, found, at, rounds=2)
             if placement.inliers >= max(need, 0.4 * len(found)):
                 return placement
         return None
@@ -196,6 +196,7 @@ class Localiser:
         T_start: Floats,
         rows: Ints,
         at: Ints,
+        rounds: int = 4,
     ) -> Placement:
         estimate = refine_pose(
             self._camera,
@@ -204,6 +205,7 @@ class Localiser:
             self._map.covariance_w[rows],
             features.px[at],
             features.sigma_px[at],
+            rounds=rounds,
         )
         point_ids = np.full(len(features), -1, dtype=np.int64)
         point_ids[at[estimate.inliers]] = rows[estimate.inliers]

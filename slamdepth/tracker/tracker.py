@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,11 +18,13 @@ from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.features import Features, create_extractor
-from slamdepth.geometry import invert, rotation_angle_rad, so3_exp, so3_log
-from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.geometry import invert, so3_exp, so3_log
+from slamdepth.mapping.landmarks import LandmarkMap
 from slamdepth.tracker.checks import check_frame, model_for
+from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.finish import build_reconstruction, optimise_everything
 from slamdepth.tracker.frame_log import FrameLog
+from slamdepth.tracker.keyframes import Keyframes, Moved
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Localiser, Placement
 from slamdepth.tracker.loop_closer import LoopCloser
@@ -44,8 +48,14 @@ log = logging.getLogger(__name__)
 
 _MAX_EXTRAPOLATION = 3.0  # frame intervals the constant velocity is believed for
 _RELOCALISATION_CANDIDATES = 4
-_START_KEYFRAMES = 5  # until so many, most points are known by a predicted depth only
-_RESCUE_STEP_M, _RESCUE_TURN_RAD = 0.1, 0.15  # between keyframes without features
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A frame's features, and how long they took to find, in milliseconds."""
+
+    features: Features
+    took_ms: float
 
 
 class Tracker:
@@ -73,32 +83,47 @@ class Tracker:
     ) -> None:
         self.camera = camera
         self.config = config or Config()
-        self._depth_model = model_for(depth_model, self.config)
+        self._depth = DepthThread(model_for(depth_model, self.config))
         self._extractor = create_extractor(self.config.features)
+        self._extracting = threading.Lock()
         self._map = LandmarkMap()
         self._localiser = Localiser(camera, self.config, self._map)
         self._mapper = LocalMapper(camera, self.config, self._map, self._localiser)
         self._loops = LoopCloser(self.config, self._map, self._localiser)
         self._rescue = CloudRescue(camera, self.config, self._map)
         self._log = FrameLog(camera, self._map)
+        self._keyframes = Keyframes(
+            self.config, self._map, self._mapper, self._loops, self._log, self._depth, self._timed
+        )
         self._last: Placement | None = None
         self._velocity = np.eye(4)  # T_camera(now)_camera(before)
         self._last_time_s = -np.inf
         self._last_step_s = 0.0
-        self._reference_overlap = 0
         self._frames = 0
         self._relocalisations = 0
         self._rescues = 0
         self._finished = False
-        self._predicted_depth: tuple[Frame, DepthPrediction] | None = None
         self._timings: dict[str, float] = {}
         self._totals: dict[str, list[float]] = defaultdict(list)
+        _load_libraries()
 
-    def step(self, frame: Frame) -> StepResult:
+    def prepare(self, frame: Frame) -> Prepared:
+        """What :meth:`step` needs of a frame and can be found out ahead, in another thread, say."""
+        import cv2
+
+        start = time.perf_counter()
+        with self._extracting:
+            gray = np.asarray(cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+            features = self._extractor.extract(gray, self.camera)
+        return Prepared(features, (time.perf_counter() - start) * 1e3)
+
+    def step(self, frame: Frame, prepared: Prepared | None = None) -> StepResult:
         """Place the next frame.
 
         Args:
             frame: later than all before; taken by ``self.camera``.
+            prepared: what :meth:`prepare` gave for it; None prepares it here. The result
+                is the same.
 
         Returns:
             Its pose and what was done; ``T_world_camera`` is None where it was lost.
@@ -110,25 +135,29 @@ class Tracker:
         check_frame(frame, self.camera, self._last_time_s, self._finished)
         self._timings = {}
         with one_blas_thread():
-            result = self._step(frame)
+            result = self._step(frame, prepared or self.prepare(frame))
         self._last_time_s = frame.timestamp_s
         return result
 
-    def _step(self, frame: Frame) -> StepResult:
-        import cv2
-
+    def _step(self, frame: Frame, prepared: Prepared) -> StepResult:
         self._frames += 1
-        with self._timed("features"):
-            gray = np.asarray(cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-            features = self._extractor.extract(gray, self.camera)
+        features = prepared.features
+        self._measured("features", prepared.took_ms)
         if not self._map.keyframes:
             return self._start(frame, features)
+        self._keyframes.count_frame()
+        if self._keyframes.is_due:
+            self._join()
         with self._timed("tracking"):
             placement, status = self._place(frame, features)
         if placement is None:
             self._last = None
             return self._result(frame, TrackingStatus.LOST, None, False)
-        is_keyframe = self._wants_keyframe(placement) and self._can_be_keyframe(frame)
+        is_keyframe = self._keyframes.wants(placement) and self._depth.has_depth(frame)
+        if is_keyframe and self._keyframes.is_waiting:
+            # the depth that is on its way comes first: one keyframe waits at a time
+            placement = self._place_again(features, placement)
+            is_keyframe = self._keyframes.wants(placement)
         if is_keyframe:
             before = placement
             placement = self._make_keyframe(frame, features, placement)
@@ -138,11 +167,33 @@ class Tracker:
         self._log.add(frame.timestamp_s, features, placement, is_keyframe)
         return self._result(frame, status, placement, is_keyframe)
 
+    def _join(self) -> Moved | None:
+        """Let the waiting keyframe have its depth, and follow the map."""
+        moved = self._keyframes.join()
+        if moved is not None and self._last is not None:
+            self._last = replace(self._last, T_camera_world=moved.carry(self._last.T_camera_world))
+        return moved
+
+    def _place_again(self, features: Features, placement: Placement) -> Placement:
+        """Place a frame in the map that its keyframe's depth has just made larger."""
+        moved = self._join()
+        assert moved is not None
+        rows = self._map.resolve(placement.point_ids)
+        carried = Placement(moved.carry(placement.T_camera_world), rows)
+        with self._timed("tracking"):
+            return self._localiser.refine_in_local_map(features, carried) or carried
+
+    def _make_keyframe(self, frame: Frame, features: Features, placement: Placement) -> Placement:
+        keyframe = self._keyframes.make(frame, features, placement)
+        if self._keyframes.is_due:
+            self._keyframes.join()
+        return Placement(keyframe.T_camera_world.copy(), keyframe.point_ids.copy())
+
     def _start(self, frame: Frame, features: Features) -> StepResult:
         need = self.config.tracking.min_inliers
-        if len(features) < need or not self._can_be_keyframe(frame):
+        if len(features) < need or not self._depth.has_depth(frame):
             return self._result(frame, TrackingStatus.INITIALISING, None, False)
-        if self._mapper.count_births(features, self._predict_depth(frame)) < need:
+        if self._mapper.count_births(features, self._depth_of(frame)) < need:
             return self._result(frame, TrackingStatus.INITIALISING, None, False)
         empty = Placement(np.eye(4), np.full(len(features), -1, dtype=np.int64))
         placement = self._make_keyframe(frame, features, empty)
@@ -172,6 +223,8 @@ class Tracker:
             placement = self._localiser.track(features, T_guess, np.unique(rows[rows >= 0]))
             if placement is not None:
                 return placement, TrackingStatus.TRACKING
+            if self._join() is not None:
+                return self._place(frame, features)
             placement = self._localiser.from_keyframe(features, len(self._map.keyframes) - 1)
             if placement is not None:
                 return placement, TrackingStatus.TRACKING
@@ -209,9 +262,9 @@ class Tracker:
         return None
 
     def _register(self, frame: Frame, features: Features, T_guess: Floats) -> Placement | None:
-        if not self._can_be_keyframe(frame):
+        if not self._depth.has_depth(frame):
             return None
-        T = self._rescue.place(self._predict_depth(frame), T_guess)
+        T = self._rescue.place(self._depth_of(frame), T_guess)
         if T is None:
             return None
         log.info("frame %d: too few features match; placed by registration of its depth", frame.index)
@@ -221,63 +274,9 @@ class Tracker:
         )
         return self._localiser.attach(features, empty, recent)
 
-    def _can_be_keyframe(self, frame: Frame) -> bool:
-        """A sensor may have no depth for a frame; a network always has."""
-        return self._depth_model.name != "sensor" or frame.depth_m is not None
-
-    def _predict_depth(self, frame: Frame) -> DepthPrediction:
-        if self._predicted_depth is None or self._predicted_depth[0] is not frame:
-            with self._timed("depth"):
-                self._predicted_depth = (frame, self._depth_model.predict(frame))
-        return self._predicted_depth[1]
-
-    def _wants_keyframe(self, placement: Placement) -> bool:
-        """The view has moved on when much of what the last keyframe saw is seen no more."""
-        reference = self._map.keyframes[-1]
-        seen = np.zeros(self._map.size + 1, dtype=bool)
-        seen[placement.point_ids] = True
-        seen[-1] = False
-        still = int(np.count_nonzero(seen[reference.point_ids]))
-        self._reference_overlap = max(self._reference_overlap, still)
-        tracking = self.config.tracking
-        if placement.inliers < tracking.min_inliers:
-            # rescued: worth a keyframe where there are features to go on with, or new surfaces
-            many = len(placement.point_ids) >= tracking.keyframe_min_inliers
-            return many or self._has_moved_on(placement, reference)
-        if self._reference_overlap < tracking.min_inliers:
-            return True  # the last keyframe saw too little to measure by
-        starting = len(self._map.keyframes) < _START_KEYFRAMES
-        enough = tracking.keyframe_overlap_start if starting else tracking.keyframe_overlap
-        if still < enough * self._reference_overlap:
-            return True
-        return placement.inliers < tracking.keyframe_min_inliers and still < 0.9 * self._reference_overlap
-
-    def _has_moved_on(self, placement: Placement, reference: MapKeyframe) -> bool:
-        D = placement.T_camera_world @ reference.T_world_camera
-        turned = float(rotation_angle_rad(D[:3, :3]))
-        return float(np.linalg.norm(D[:3, 3])) > _RESCUE_STEP_M or turned > _RESCUE_TURN_RAD
-
-    def _make_keyframe(self, frame: Frame, features: Features, placement: Placement) -> Placement:
-        prediction = self._predict_depth(frame)
-        with self._timed("mapping"):
-            keyframe = self._mapper.insert(
-                frame, features, placement.T_camera_world, placement.point_ids, prediction
-            )
-            self._mapper.search_neighbours(keyframe)
-        with self._timed("bundle"):
-            self._mapper.adjust_window(keyframe)
-        with self._timed("loops"):
-            self._loops.add(keyframe)
-            correction = self._loops.close(keyframe)
-        if correction is not None:
-            self._log.rescale(correction.scales)
-            with self._timed("bundle"):
-                self._mapper.search_neighbours(keyframe)
-                self._mapper.adjust_window(keyframe)
-        with self._timed("mapping"):
-            self._mapper.cull(keyframe)
-        self._reference_overlap = 0
-        return Placement(keyframe.T_camera_world.copy(), keyframe.point_ids.copy())
+    def _depth_of(self, frame: Frame) -> DepthPrediction:
+        with self._timed("depth"):
+            return self._depth.take(frame)
 
     def _remember_motion(self, frame: Frame, measured: Placement, final: Placement) -> None:
         """Velocity from the pose as measured, so that a correction of the map is not taken for motion."""
@@ -300,20 +299,22 @@ class Tracker:
             raise TrackingError("no frame could be placed: too few features, or no depth")
         self._finished = True
         self._timings = {}
-        with one_blas_thread(), self._timed("final"):
-            notes = optimise_everything(self._map, self._mapper, self._log, self.config)
-        mean = {stage: float(np.mean(values)) for stage, values in self._totals.items()}
-        return build_reconstruction(
-            self._map,
-            self._mapper,
-            self._log,
-            frames_total=self._frames,
-            loop_closures=self._loops.count,
-            relocalisations=self._relocalisations,
-            rescues=self._rescues,
-            timings_ms=mean,
-            notes=notes,
-        )
+        with one_blas_thread():
+            self._join()
+            self._depth.close()
+            with self._timed("final"):
+                notes = optimise_everything(self._map, self._mapper, self._log, self.config)
+            return build_reconstruction(
+                self._map,
+                self._mapper,
+                self._log,
+                frames_total=self._frames,
+                loop_closures=self._loops.count,
+                relocalisations=self._relocalisations,
+                rescues=self._rescues,
+                timings_ms={stage: float(np.mean(values)) for stage, values in self._totals.items()},
+                notes=notes,
+            )
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:
@@ -321,6 +322,15 @@ class Tracker:
         try:
             yield
         finally:
-            ms = (time.perf_counter() - start) * 1e3
-            self._timings[stage] = self._timings.get(stage, 0.0) + ms
-            self._totals[stage].append(ms)
+            self._measured(stage, (time.perf_counter() - start) * 1e3)
+
+    def _measured(self, stage: str, ms: float) -> None:
+        self._timings[stage] = self._timings.get(stage, 0.0) + ms
+        self._totals[stage].append(ms)
+
+
+def _load_libraries() -> None:
+    """Import now what the first keyframes would import: a second's pause in the middle of tracking."""
+    import gtsam  # noqa: F401
+    import scipy.linalg
+    import scipy.sparse  # noqa: F401

@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Levenberg-Marquardt for bundle adjustment, over one set of observations.
+
+The points are eliminated through the Cholesky factor of their blocks: with
+``Hpp = C C^T`` and ``Z = Hcp C^-T`` the reduced camera system is ``Hcc - Z Z^T``, one
+symmetric product. Arrays are kept by coordinate, ``(3, N)`` and not ``(N, 3)``, because
+NumPy is slow at many tiny matrices and fast at a few long rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.geometry import se3_exp
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from slamdepth.backend.bundle import BundleProblem
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+    Bools = NDArray[np.bool_]
+
+HUBER = 1.5
+CAUCHY = 2.0
+MIN_DEPTH_M = 0.01
+_CAM = 7  # translation, rotation, log depth scale
+_DENSE_LIMIT = 4_000_000  # numbers in the camera-point block before it is kept sparse
+_GAIN = 1e-4  # relative fall of the cost below which another step is not worth its time
+_SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True)
+class State:
+    """Poses ``T (K, 4, 4)`` camera from world, points ``X (P, 3)``, log scales ``a (K,)``."""
+
+    T: Floats
+    X: Floats
+    a: Floats
+
+
+@dataclass(frozen=True)
+class _System:
+    """The normal equations, by block; ``Hpp (6, P)`` holds the upper triangle."""
+
+    Hpp: Floats
+    bp: Floats
+    Hcc: Floats
+    bc: Floats
+    Hcp: Floats
+
+
+class Solver:
+    """One phase: which observations count is fixed."""
+
+    def __init__(self, problem: BundleProblem, keep: Bools) -> None:
+        self.problem = problem
+        index = np.flatnonzero(keep)
+        index = index[np.argsort(problem.obs_camera[index], kind="stable")]
+        self.cam, self.pt = problem.obs_camera[index], problem.obs_point[index]
+        self.px, self.inv_sigma_px = problem.px[index].T.copy(), 1.0 / problem.sigma_px[index]
+        has = np.isfinite(problem.log_depth[index])
+        self.log_depth = np.where(has, problem.log_depth[index], 0.0)
+        self.inv_sigma_log = np.where(has, 1.0 / np.where(has, problem.sigma_log[index], 1.0), 0.0)
+        # a fixed pose still has a depth scale of its own to be found
+        scaled = np.zeros(len(problem.fixed), dtype=bool)
+        if problem.sigma_scale > 0:
+            scaled[self.cam[has]] = True
+        self.free = np.flatnonzero(~problem.fixed | scaled)
+        self.pinned = problem.fixed[self.free]
+        self.P, self.K = len(problem.points_w), len(self.free)
+        bounds = np.searchsorted(self.cam, np.arange(len(problem.fixed) + 1)).tolist()
+        self.blocks = [slice(bounds[k], bounds[k + 1]) for k in range(len(problem.fixed))]
+
+    def run(self, state: State, limit: int) -> tuple[State, float, float, int]:
+        """At most ``limit`` steps; returns the state, the cost before and after, the steps taken."""
+        residual, weight, P = self._residual(state)
+        cost = start = self._cost(residual, state)
+        damping = 1e-4
+        taken = 0
+        for _ in range(limit):
+            taken += 1
+            system = self._linearise(state, residual, weight, P)
+            improved = False
+            for _ in range(4):
+                candidate = self._step(state, system, damping)
+                new_residual, new_weight, new_P = self._residual(candidate)
+                new_cost = self._cost(new_residual, candidate)
+                if np.isfinite(new_cost) and new_cost < cost:
+                    improved = True
+                    break
+                damping = min(damping * 10.0, 1e6)
+            if not improved:
+                break
+            gain = (cost - new_cost) / max(cost, 1e-12)
+            state, residual, weight, P, cost = candidate, new_residual, new_weight, new_P, new_cost
+            damping = max(damping * 0.2, 1e-8)
+            if gain < _GAIN:
+                break
+        return state, start, cost, taken
+
+    def _residual(self, state: State) -> tuple[Floats, Floats, Floats]:
+        """Whitened residuals ``(3, N)``, robust weights ``(2, N)``, points ``(3, N)`` in the cameras."""
+        camera = self.problem.camera
+        P = np.ascontiguousarray(state.X[self.pt].T)
+        for T, block in zip(state.T, self.blocks, strict=True):
+            P[:, block] = T[:3, :3] @ P[:, block] + T[:3, 3:]
+        P[2] = np.maximum(P[2], MIN_DEPTH_M)
+        r = np.empty_like(P)
+        r[0] = (camera.fx * P[0] / P[2] + (camera.cx - self.px[0])) * self.inv_sigma_px
+        r[1] = (camera.fy * P[1] / P[2] + (camera.cy - self.px[1])) * self.inv_sigma_px
+        r[2] = (np.log(P[2]) - state.a[self.cam] - self.log_depth) * self.inv_sigma_log
+        weight = np.empty((2, P.shape[1]))
+        weight[0] = HUBER / np.maximum(np.sqrt(r[0] * r[0] + r[1] * r[1]), HUBER)
+        weight[1] = 1.0 / (1.0 + (r[2] / CAUCHY) ** 2)
+        return r, weight, P
+
+    def _cost(self, r: Floats, state: State) -> float:
+        norm = np.sqrt(r[0] * r[0] + r[1] * r[1])
+        pixel = np.where(norm > HUBER, 2 * HUBER * norm - HUBER * HUBER, norm * norm)
+        depth = CAUCHY * CAUCHY * np.log1p((r[2] / CAUCHY) ** 2)
+        total = float(pixel.sum() + depth.sum())
+        if self.problem.sigma_scale > 0:
+            total += float(np.sum((state.a / self.problem.sigma_scale) ** 2))
+        return total
+
+    def _point_blocks(
+        self, state: State, r: Floats, weight: Floats, P: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """``Hpp (6, P)``, ``bp (3, P)``; and by observation: derivatives by the point, weighted residuals."""
+        camera = self.problem.camera
+        root = np.sqrt(weight)
+        gain_px, gain_log = root[0] * self.inv_sigma_px, root[1] * self.inv_sigma_log
+        inv_z = 1.0 / P[2]
+        # residual by the point in the camera frame: the five numbers of each 3 x 3 that are not 0
+        A = np.empty((5, P.shape[1]))
+        A[0] = camera.fx * inv_z * gain_px
+        A[1] = -A[0] * P[0] * inv_z
+        A[2] = camera.fy * inv_z * gain_px
+        A[3] = -A[2] * P[1] * inv_z
+        A[4] = inv_z * gain_log
+        b = np.stack([r[0] * root[0], r[1] * root[0], r[2] * root[1]])
+        Jp = np.empty((3, 3, P.shape[1]))
+        for T, block in zip(state.T, self.blocks, strict=True):
+            right, down, forward = T[:3, :3, None]
+            Jp[0, :, block] = A[0, block] * right + A[1, block] * forward
+            Jp[1, :, block] = A[2, block] * down + A[3, block] * forward
+            Jp[2, :, block] = A[4, block] * forward
+        Hpp = np.stack([self._by_point((Jp[:, i] * Jp[:, j]).sum(axis=0)) for i, j in _SYMMETRIC])
+        bp = np.stack([self._by_point((Jp[:, i] * b).sum(axis=0)) for i in range(3)])
+        return Hpp, bp, A, Jp, b
+
+    def _by_point(self, values: Floats) -> Floats:
+        """Sums ``(P,)`` over the observations of each point."""
+        return np.asarray(np.bincount(self.pt, values, minlength=self.P), dtype=np.float64)
+
+    def _linearise(self, state: State, r: Floats, weight: Floats, P: Floats) -> _System:
+        Hpp, bp, A, Jp, b = self._point_blocks(state, r, weight, P)
+        x, y, z = P
+        sigma_scale = self.problem.sigma_scale
+        Jc = np.zeros((_CAM, 3, P.shape[1]))
+        Jc[0, 0], Jc[2, 0] = A[0], A[1]
+        Jc[1, 1], Jc[2, 1] = A[2], A[3]
+        Jc[2, 2] = A[4]
+        Jc[3] = Jc[2] * y - Jc[1] * z
+        Jc[4] = Jc[0] * z - Jc[2] * x
+        Jc[5] = Jc[1] * x - Jc[0] * y
+        if sigma_scale > 0:
+            Jc[6, 2] = -A[4] * z
+        Hcc = np.zeros((self.K, _CAM, _CAM))
+        bc = np.zeros((self.K, _CAM))
+        for slot, camera in enumerate(self.free.tolist()):
+            block = self.blocks[camera]
+            if self.pinned[slot]:
+                Jc[:6, :, block] = 0.0
+            flat = Jc[:, :, block].reshape(_CAM, -1)
+            Hcc[slot] = flat @ flat.T
+            bc[slot] = flat @ b[:, block].ravel()
+        Hcc[np.flatnonzero(self.pinned)[:, None], np.arange(6), np.arange(6)] += 1.0
+        if sigma_scale > 0:
+            Hcc[:, 6, 6] += 1.0 / sigma_scale**2
+            bc[:, 6] += state.a[self.free] / sigma_scale**2
+        else:
+            Hcc[:, 6, 6] += 1.0
+        return _System(Hpp, bp, Hcc, bc, np.einsum("irn,rjn->ijn", Jc, Jp))
+
+    def _step(self, state: State, system: _System, damping: float) -> State:
+        M = _inverse_factor(system.Hpp, damping)
+        Z = _times_transposed(system.Hcp, M[:, self.pt])
+        y = _times(M, system.bp)
+        S, rhs = np.zeros((self.K, _CAM, self.K, _CAM)), system.bc.copy()
+        damped = system.Hcc.copy()
+        diagonal = np.arange(_CAM)
+        damped[:, diagonal, diagonal] += damping * system.Hcc[:, diagonal, diagonal] + 1e-6
+        each = np.arange(self.K)
+        S[each, :, each] = damped
+        y_seen = y[:, self.pt]
+        for slot, camera in enumerate(self.free.tolist()):
+            block = self.blocks[camera]
+            rhs[slot] -= np.einsum("ijn,jn->i", Z[:, :, block], y_seen[:, block])
+        size = self.K * _CAM
+        reduced = S.reshape(size, size) - self._coupling(Z)
+        delta_c = -_solve_positive(reduced, rhs.ravel()).reshape(self.K, _CAM)
+        back = np.zeros((3, len(self.pt)))
+        for slot, camera in enumerate(self.free.tolist()):
+            block = self.blocks[camera]
+            back[:, block] = np.einsum("ijn,i->jn", Z[:, :, block], delta_c[slot])
+        delta_p = -_transposed_times(M, y + np.stack([self._by_point(row) for row in back]))
+        T, a = state.T.copy(), state.a.copy()
+        T[self.free] = se3_exp(delta_c[:, :6]) @ T[self.free]
+        if self.problem.sigma_scale > 0:
+            a[self.free] += delta_c[:, 6]
+        return State(T, state.X + delta_p.T, a)
+
+    def _coupling(self, Z: Floats) -> Floats:
+        """``Z Z^T`` over all points, ``(7 K, 7 K)``."""
+        size = self.K * _CAM
+        if size * self.P * 3 <= _DENSE_LIMIT:
+            dense = np.zeros((self.K, _CAM, 3, self.P))
+            for slot, camera in enumerate(self.free.tolist()):
+                block = self.blocks[camera]
+                dense[slot][:, :, self.pt[block]] = Z[:, :, block]
+            flat = dense.reshape(size, 3 * self.P)
+            return flat @ flat.T
+        from scipy.sparse import csr_matrix
+
+        rows, cols, values = [], [], []
+        for slot, camera in enumerate(self.free.tolist()):
+            block = self.blocks[camera]
+            shape = Z[:, :, block].shape
+            rows.append(
+                np.broadcast_to(np.arange(slot * _CAM, slot * _CAM + _CAM)[:, None, None], shape).ravel()
+            )
+            cols.append(np.broadcast_to(self.pt[block] + self.P * np.arange(3)[:, None], shape).ravel())
+            values.append(Z[:, :, block].ravel())
+        sparse = csr_matrix(
+            (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=(size, 3 * self.P)
+        )
+        return np.asarray((sparse @ sparse.T).toarray())
+
+    def point_covariance(self, state: State) -> Floats:
+        """Covariance ``(P, 3, 3)`` in square metres of each point, given the poses."""
+        Hpp = self._point_blocks(state, *self._residual(state))[0]
+        full = np.empty((self.P, 3, 3))
+        for row, (i, j) in zip(Hpp, _SYMMETRIC, strict=True):
+            full[:, i, j] = full[:, j, i] = row
+        return np.asarray(np.linalg.inv(full + np.eye(3) * 1e-3), dtype=np.float64)
+
+
+def _inverse_factor(H: Floats, damping: float) -> Floats:
+    """``(6, P)`` M, lower triangular by rows, with ``M^T M`` the inverse of the damped ``H``."""
+    h00, h01, h02, h11, h12, h22 = H
+    c00 = np.sqrt(h00 * (1.0 + damping) + 1e-6)
+    c10, c20 = h01 / c00, h02 / c00
+    c11 = np.sqrt(np.maximum(h11 * (1.0 + damping) + 1e-6 - c10 * c10, 1e-12))
+    c21 = (h12 - c20 * c10) / c11
+    c22 = np.sqrt(np.maximum(h22 * (1.0 + damping) + 1e-6 - c20 * c20 - c21 * c21, 1e-12))
+    m00, m11, m22 = 1.0 / c00, 1.0 / c11, 1.0 / c22
+    m10 = -c10 * m00 * m11
+    return np.stack([m00, m10, m11, -(c20 * m00 + c21 * m10) * m22, -c21 * m11 * m22, m22])
+
+
+def _times(M: Floats, v: Floats) -> Floats:
+    """``M v`` for ``(6, P)`` and ``(3, P)``."""
+    return np.stack([M[0] * v[0], M[1] * v[0] + M[2] * v[1], M[3] * v[0] + M[4] * v[1] + M[5] * v[2]])
+
+
+def _transposed_times(M: Floats, v: Floats) -> Floats:
+    """``M^T v``."""
+    return np.stack([M[0] * v[0] + M[1] * v[1] + M[3] * v[2], M[2] * v[1] + M[4] * v[2], M[5] * v[2]])
+
+
+def _times_transposed(B: Floats, M: Floats) -> Floats:
+    """``B M^T`` for ``(C, 3, N)`` and ``(6, N)``."""
+    out = np.empty_like(B)
+    out[:, 0] = B[:, 0] * M[0]
+    out[:, 1] = B[:, 0] * M[1] + B[:, 1] * M[2]
+    out[:, 2] = B[:, 0] * M[3] + B[:, 1] * M[4] + B[:, 2] * M[5]
+    return out
+
+
+def _solve_positive(S: Floats, rhs: Floats) -> Floats:
+    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+    try:
+        return cho_solve(cho_factor(S, check_finite=False), rhs, check_finite=False)
+    except LinAlgError:
+        return np.asarray(np.linalg.lstsq(S, rhs, rcond=None)[0], dtype=np.float64)

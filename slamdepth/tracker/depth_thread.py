@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth predicted in a thread of its own, one frame after the other."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from slamdepth.depth.base import DepthModel
+from slamdepth.tracker.threads import one_thread_here
+from slamdepth.types import DepthPrediction, Frame
+
+
+class DepthThread:
+    """Runs a depth model beside the tracker.
+
+    The thread computes on one core: the tracker needs the other, and sums do not depend on
+    how many there are. A sensor's depth is there already and is passed on at once.
+    """
+
+    def __init__(self, model: DepthModel) -> None:
+        self._model = model
+        self._pool = ThreadPoolExecutor(1, "slamdepth-depth", initializer=one_thread_here)
+        self._asked: tuple[Frame, Future[DepthPrediction]] | None = None
+        self._taken: Frame | None = None
+
+    def has_depth(self, frame: Frame) -> bool:
+        """A sensor may have no depth for a frame; a network always has."""
+        return self._model.name != "sensor" or frame.depth_m is not None
+
+    def is_instant(self, frame: Frame) -> bool:
+        """Whether the depth of ``frame`` costs no wait: a sensor's, or one taken before."""
+        return self._model.name == "sensor" or self._taken is frame
+
+    def ask(self, frame: Frame) -> None:
+        """Start the prediction for ``frame``, unless it was the last one asked for."""
+        if self._asked is None or self._asked[0] is not frame:
+            self._asked = (frame, self._pool.submit(self._model.predict, frame))
+            self._taken = None
+
+    def take(self, frame: Frame) -> DepthPrediction:
+        """The prediction for ``frame``; waits for it."""
+        self.ask(frame)
+        assert self._asked is not None
+        self._taken = frame
+        return self._asked[1].result()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._pool.shutdown(wait=True)

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What runs beside the tracker: however slow it is, the result is the same."""
+
+from __future__ import annotations
+
+import threading
+import time
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from tracking_scene import CAMERA, CONFIG, COUNT, ConstantDepth, Run, ate_m, colour_only, frames
+
+from slamdepth.config import Config
+from slamdepth.errors import CameraError
+from slamdepth.geometry import so3_exp
+from slamdepth.mapping.landmarks import MapKeyframe
+from slamdepth.tracker import Tracker
+from slamdepth.tracker.keyframes import Moved
+from slamdepth.types import DepthPrediction, Frame, Reconstruction, TrackingStatus
+
+
+class LateDepth(ConstantDepth):
+    """Takes its time, another one for each frame."""
+
+    def __init__(self, seed: int, most_s: float) -> None:
+        super().__init__()
+        self._random, self._most_s = np.random.default_rng(seed), most_s
+        self.threads: set[str] = set()
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        self.threads.add(threading.current_thread().name)
+        time.sleep(self._random.uniform(0.0, self._most_s))
+        return super().predict(frame)
+
+
+def delayed(frames_late: int) -> Config:
+    return CONFIG.model_copy(
+        update={"tracking": CONFIG.tracking.model_copy(update={"depth_delay": frames_late})}
+    )
+
+
+@lru_cache(maxsize=1)
+def prompt() -> tuple[Run, Reconstruction]:
+    run = Run(frames(change=colour_only), LateDepth(0, 0.0))
+    return run, run.finish()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_slow_network_changes_nothing(seed: int) -> None:
+    run, expected = prompt()
+    slow = Run(frames(change=colour_only), LateDepth(seed, 0.3))
+    made = slow.finish()
+    np.testing.assert_array_equal(made.trajectory.T_world_camera, expected.trajectory.T_world_camera)
+    np.testing.assert_array_equal(made.points_m, expected.points_m)
+    for one, other in zip(run.results, slow.results, strict=True):
+        np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
+        assert one.is_keyframe == other.is_keyframe
+
+
+def test_frames_prepared_ahead_change_nothing() -> None:
+    _, expected = prompt()
+    tracker = Tracker(CAMERA, ConstantDepth(), CONFIG)
+    given = frames(change=colour_only)
+    with_features = [tracker.prepare(frame) for frame in given]
+    for frame, prepared in zip(given, with_features, strict=True):
+        assert tracker.step(frame, prepared).timings_ms["features"] == prepared.took_ms
+    made = tracker.finish()
+    np.testing.assert_array_equal(made.trajectory.T_world_camera, expected.trajectory.T_world_camera)
+
+
+@pytest.mark.parametrize("late", [0, 2, 8])
+def test_depth_may_be_late_by_any_number_of_frames(late: int) -> None:
+    model = LateDepth(0, 0.0)
+    run = Run(frames(change=colour_only), model, delayed(late))
+    assert run.statuses() == {TrackingStatus.TRACKING: COUNT}
+    keyframes = [r.index for r in run.results if r.is_keyframe]
+    adjusted = [r.index for r in run.results if "bundle" in r.timings_ms]
+    assert keyframes[0] == adjusted[0] == 0  # nothing to track on before the first one's depth
+    # one keyframe waits at a time, for so many frames at most
+    for keyframe, joined in zip(keyframes[1:], adjusted[1:], strict=False):
+        assert keyframe <= joined <= keyframe + late
+    for joined, following in zip(adjusted, keyframes[1:], strict=False):
+        assert joined <= following
+    made = run.finish()
+    assert len(made.keyframes) == model.calls == len(keyframes)
+    assert all(k.prediction is not None for k in made.keyframes)
+    assert ate_m(made.trajectory, with_scale=True) < 0.03
+    R = made.trajectory.T_world_camera[:, :3, :3]
+    np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
+
+
+def test_the_network_runs_in_one_thread_that_ends_with_the_run() -> None:
+    before = threading.active_count()
+    model = LateDepth(0, 0.0)
+    run = Run(frames(range(12), colour_only), model)
+    run.finish()
+    assert len(model.threads) == 1
+    assert threading.current_thread().name not in model.threads
+    assert threading.active_count() == before
+
+
+def test_what_the_network_refuses_is_told_by_a_later_step() -> None:
+    class Broken(ConstantDepth):
+        def predict(self, frame: Frame) -> DepthPrediction:
+            if self.calls == 1:
+                raise CameraError("too small for the network")
+            return super().predict(frame)
+
+    with pytest.raises(CameraError, match="too small"):
+        Run(frames(range(40), colour_only), Broken())
+
+
+def test_a_pose_follows_the_keyframe_and_stays_a_rotation() -> None:
+    """Carried a hundred times, each time from the pose before, rounding must not double."""
+    rng = np.random.default_rng(0)
+    keyframe = MapKeyframe(
+        0, frames([0])[0], None, np.eye(4), np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
+    )
+    T = np.eye(4)
+    for _ in range(100):
+        keyframe.T_camera_world = T.copy()
+        moved = Moved(keyframe, keyframe.T_world_camera, scale=2.0)
+        change = np.eye(4)
+        change[:3, :3], change[:3, 3] = so3_exp(rng.normal(size=3)), rng.normal(size=3)
+        keyframe.T_camera_world = change @ keyframe.T_camera_world
+        relative = np.eye(4)
+        relative[:3, 3] = [1.0, 0.0, 0.0]
+        expected = relative.copy()
+        expected[:3, 3] *= 2.0
+        T = moved.carry(relative @ T)
+        np.testing.assert_allclose(T, expected @ keyframe.T_camera_world, atol=1e-9)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-14)
