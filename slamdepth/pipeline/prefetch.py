@@ -50,7 +50,7 @@ class FramePrefetcher:
         *,
         with_depth: bool,
         prepare: Callable[[Frame], Any] | None = None,
-        capacity: int = 4,
+        capacity: int = 8,
     ) -> None:
         self._dataset = dataset
         self._indices = indices
