@@ -226,19 +226,18 @@ class Solver:
                 dense[slot][:, :, self.pt[block]] = Z[:, :, block]
             flat = dense.reshape(size, 3 * self.P)
             return flat @ flat.T
-        from scipy.sparse import csr_matrix
+        from scipy.sparse import bsr_matrix
 
-        rows, cols, values = [], [], []
-        for slot, camera in enumerate(self.free.tolist()):
-            block = self.blocks[camera]
-            shape = Z[:, :, block].shape
-            rows.append(
-                np.broadcast_to(np.arange(slot * _CAM, slot * _CAM + _CAM)[:, None, None], shape).ravel()
-            )
-            cols.append(np.broadcast_to(self.pt[block] + self.P * np.arange(3)[:, None], shape).ravel())
-            values.append(Z[:, :, block].ravel())
-        sparse = csr_matrix(
-            (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=(size, 3 * self.P)
+        blocks = [self.blocks[camera] for camera in self.free.tolist()]
+        seen = np.concatenate([np.arange(block.start, block.stop) for block in blocks])
+        counts = [block.stop - block.start for block in blocks]
+        sparse = bsr_matrix(
+            (
+                np.ascontiguousarray(Z[:, :, seen].transpose(2, 0, 1)),
+                self.pt[seen],
+                np.concatenate([[0], np.cumsum(counts)]),
+            ),
+            shape=(size, 3 * self.P),
         )
         return np.asarray((sparse @ sparse.T).toarray())
 

@@ -31,7 +31,7 @@ _MAX_KEYFRAMES = 600  # beyond, the reduced camera system outgrows a laptop's me
 def optimise_everything(
     landmarks: LandmarkMap, mapper: LocalMapper, frames: FrameLog, config: Config
 ) -> list[str]:
-    """Global bundle adjustment, metric scale, and every frame placed anew; returns notes."""
+    """Global bundle adjustment and metric scale; returns notes."""
     notes = []
     keyframes = landmarks.keyframes
     if config.bundle.final and 3 <= len(keyframes) <= _MAX_KEYFRAMES:
@@ -47,8 +47,6 @@ def optimise_everything(
     prediction = keyframes[0].prediction
     if prediction is not None and not prediction.is_sensor:
         notes.append(_make_metric(landmarks, frames))
-    if config.bundle.final:
-        frames.refine()
     return notes
 
 
@@ -97,6 +95,7 @@ def build_reconstruction(
     mapper: LocalMapper,
     frames: FrameLog,
     *,
+    refine_frames: bool,
     frames_total: int,
     loop_closures: int,
     relocalisations: int,
@@ -104,11 +103,17 @@ def build_reconstruction(
     timings_ms: dict[str, float],
     notes: list[str],
 ) -> Reconstruction:
-    """The value handed to the user."""
+    """The value handed to the user, with every frame placed anew where ``refine_frames``."""
+    # depth images are large, and NumPy makes them in other threads while this one places frames
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        making = [pool.submit(_final, keyframe, mapper) for keyframe in landmarks.keyframes]
+        if refine_frames:
+            frames.refine()
+        keyframes = tuple(made.result() for made in making)
     good = landmarks.alive[: landmarks.size] & (landmarks.observations[: landmarks.size] >= 2)
     return Reconstruction(
         trajectory=frames.trajectory(),
-        keyframes=_final_keyframes(landmarks, mapper),
+        keyframes=keyframes,
         points_m=landmarks.position_w[: landmarks.size][good],
         frames=frames_total,
         tracked=len(frames),
@@ -118,12 +123,6 @@ def build_reconstruction(
         timings_ms=timings_ms,
         notes=tuple(notes),
     )
-
-
-def _final_keyframes(landmarks: LandmarkMap, mapper: LocalMapper) -> tuple[Keyframe, ...]:
-    """Depth images are large and independent: NumPy works on several at once."""
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        return tuple(pool.map(lambda keyframe: _final(keyframe, mapper), landmarks.keyframes))
 
 
 def _final(keyframe: MapKeyframe, mapper: LocalMapper) -> Keyframe:

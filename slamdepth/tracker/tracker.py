@@ -308,6 +308,7 @@ class Tracker:
                 self._map,
                 self._mapper,
                 self._log,
+                refine_frames=self.config.bundle.final,
                 frames_total=self._frames,
                 loop_closures=self._loops.count,
                 relocalisations=self._relocalisations,
