@@ -10,8 +10,6 @@ the network was, so the trajectory is the same on every machine.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -26,6 +24,7 @@ from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Placement
 from slamdepth.tracker.loop_closer import LoopCloser
+from slamdepth.tracker.stopwatch import Stopwatch
 from slamdepth.types import Frame
 
 if TYPE_CHECKING:
@@ -63,7 +62,7 @@ class Keyframes:
     """Chooses keyframes and grows the map with them.
 
     Args:
-        timed: measures a stage by its name.
+        watch: measures the stages.
     """
 
     def __init__(
@@ -74,7 +73,7 @@ class Keyframes:
         loops: LoopCloser,
         frames: FrameLog,
         depth: DepthThread,
-        timed: Callable[[str], AbstractContextManager[None]],
+        watch: Stopwatch,
     ) -> None:
         self._config = config
         self._map = landmarks
@@ -82,7 +81,7 @@ class Keyframes:
         self._loops = loops
         self._log = frames
         self._depth = depth
-        self._timed = timed
+        self._timed = watch.timed
         self._reference_overlap = 0.0
         self._still = 0
         self._seen_share = 1.0  # of what the last keyframe knew, when its own points were born

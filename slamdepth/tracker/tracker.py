@@ -4,12 +4,7 @@
 from __future__ import annotations
 
 import logging
-import threading
-import time
-from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +12,7 @@ import numpy as np
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
 from slamdepth.errors import TrackingError
-from slamdepth.frontend.features import Features, create_extractor
+from slamdepth.frontend.features import Features
 from slamdepth.geometry import invert, so3_exp, so3_log
 from slamdepth.mapping.landmarks import LandmarkMap
 from slamdepth.tracker.checks import check_frame, model_for
@@ -28,7 +23,9 @@ from slamdepth.tracker.keyframes import Keyframes, Moved
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Localiser, Placement
 from slamdepth.tracker.loop_closer import LoopCloser
+from slamdepth.tracker.prepare import Preparation, Prepared, load_libraries
 from slamdepth.tracker.rescue import CloudRescue
+from slamdepth.tracker.stopwatch import Stopwatch
 from slamdepth.tracker.threads import one_blas_thread
 from slamdepth.types import (
     Camera,
@@ -48,14 +45,6 @@ log = logging.getLogger(__name__)
 
 _MAX_EXTRAPOLATION = 3.0  # frame intervals the constant velocity is believed for
 _RELOCALISATION_CANDIDATES = 4
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A frame's features, and how long they took to find, in milliseconds."""
-
-    features: Features
-    took_ms: float
 
 
 class Tracker:
@@ -84,8 +73,8 @@ class Tracker:
         self.camera = camera
         self.config = config or Config()
         self._depth = DepthThread(model_for(depth_model, self.config))
-        self._extractor = create_extractor(self.config.features)
-        self._extracting = threading.Lock()
+        self._preparation = Preparation(camera, self.config.features)
+        self._watch = Stopwatch()
         self._map = LandmarkMap()
         self._localiser = Localiser(camera, self.config, self._map)
         self._mapper = LocalMapper(camera, self.config, self._map, self._localiser)
@@ -93,7 +82,7 @@ class Tracker:
         self._rescue = CloudRescue(camera, self.config, self._map)
         self._log = FrameLog(camera, self._map)
         self._keyframes = Keyframes(
-            self.config, self._map, self._mapper, self._loops, self._log, self._depth, self._timed
+            self.config, self._map, self._mapper, self._loops, self._log, self._depth, self._watch
         )
         self._last: Placement | None = None
         self._velocity = np.eye(4)  # T_camera(now)_camera(before)
@@ -103,19 +92,11 @@ class Tracker:
         self._relocalisations = 0
         self._rescues = 0
         self._finished = False
-        self._timings: dict[str, float] = {}
-        self._totals: dict[str, list[float]] = defaultdict(list)
-        _load_libraries()
+        load_libraries()
 
     def prepare(self, frame: Frame) -> Prepared:
         """What :meth:`step` needs of a frame and can be found out ahead, in another thread, say."""
-        import cv2
-
-        start = time.perf_counter()
-        with self._extracting:
-            gray = np.asarray(cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-            features = self._extractor.extract(gray, self.camera)
-        return Prepared(features, (time.perf_counter() - start) * 1e3)
+        return self._preparation(frame)
 
     def step(self, frame: Frame, prepared: Prepared | None = None) -> StepResult:
         """Place the next frame.
@@ -133,7 +114,7 @@ class Tracker:
             CameraError: the frame was taken by another camera.
         """
         check_frame(frame, self.camera, self._last_time_s, self._finished)
-        self._timings = {}
+        self._watch.next_frame()
         with one_blas_thread():
             result = self._step(frame, prepared or self.prepare(frame))
         self._last_time_s = frame.timestamp_s
@@ -142,13 +123,13 @@ class Tracker:
     def _step(self, frame: Frame, prepared: Prepared) -> StepResult:
         self._frames += 1
         features = prepared.features
-        self._measured("features", prepared.took_ms)
+        self._watch.add("features", prepared.took_ms)
         if not self._map.keyframes:
             return self._start(frame, features)
         self._keyframes.count_frame()
         if self._keyframes.is_due:
             self._join()
-        with self._timed("tracking"):
+        with self._watch.timed("tracking"):
             placement, status = self._place(frame, features)
         if placement is None:
             self._last = None
@@ -180,7 +161,7 @@ class Tracker:
         assert moved is not None
         rows = self._map.resolve(placement.point_ids)
         carried = Placement(moved.carry(placement.T_camera_world), rows)
-        with self._timed("tracking"):
+        with self._watch.timed("tracking"):
             return self._localiser.refine_in_local_map(features, carried) or carried
 
     def _make_keyframe(self, frame: Frame, features: Features, placement: Placement) -> Placement:
@@ -213,7 +194,7 @@ class Tracker:
             is_keyframe=is_keyframe,
             keyframes=len(self._map.keyframes),
             loop_closures=self._loops.count,
-            timings_ms=self._timings,
+            timings_ms=self._watch.frame_ms,
         )
 
     def _place(self, frame: Frame, features: Features) -> tuple[Placement | None, TrackingStatus]:
@@ -275,7 +256,7 @@ class Tracker:
         return self._localiser.attach(features, empty, recent)
 
     def _depth_of(self, frame: Frame) -> DepthPrediction:
-        with self._timed("depth"):
+        with self._watch.timed("depth"):
             return self._depth.take(frame)
 
     def _remember_motion(self, frame: Frame, measured: Placement, final: Placement) -> None:
@@ -298,11 +279,11 @@ class Tracker:
         if not self._map.keyframes:
             raise TrackingError("no frame could be placed: too few features, or no depth")
         self._finished = True
-        self._timings = {}
+        self._watch.next_frame()
         with one_blas_thread():
             self._join()
             self._depth.close()
-            with self._timed("final"):
+            with self._watch.timed("final"):
                 notes = optimise_everything(self._map, self._mapper, self._log, self.config)
             return build_reconstruction(
                 self._map,
@@ -313,25 +294,6 @@ class Tracker:
                 loop_closures=self._loops.count,
                 relocalisations=self._relocalisations,
                 rescues=self._rescues,
-                timings_ms={stage: float(np.mean(values)) for stage, values in self._totals.items()},
+                timings_ms=self._watch.mean_ms(),
                 notes=notes,
             )
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._measured(stage, (time.perf_counter() - start) * 1e3)
-
-    def _measured(self, stage: str, ms: float) -> None:
-        self._timings[stage] = self._timings.get(stage, 0.0) + ms
-        self._totals[stage].append(ms)
-
-
-def _load_libraries() -> None:
-    """Import now what the first keyframes would import: a second's pause in the middle of tracking."""
-    import gtsam  # noqa: F401
-    import scipy.linalg
-    import scipy.sparse  # noqa: F401
