@@ -158,20 +158,18 @@ class _Job:
     def _predict_all(self) -> None:
         total = len(self.source)
         for done, shot in enumerate(self._shots("predicting")):
-            if self._is_done(shot):
-                self.names.append(shot.name)
-            else:
-                try:
+            try:
+                if not self._is_done(shot):
                     self._predict(shot)
-                    self.names.append(shot.name)
-                except ImageDecodeError as error:
-                    self._skip(shot, str(error))
-                except CameraError as error:
-                    if self.source.kind is not SourceKind.IMAGES:
-                        raise  # all of its images have that size
-                    self._skip(shot, str(error))
+                self.names.append(shot.name)
                 if len(self.names) == 1:
                     self._check_space(shot.name, total)
+            except ImageDecodeError as error:
+                self._skip(shot, str(error))
+            except CameraError as error:
+                if self.source.kind is not SourceKind.IMAGES:
+                    raise  # all of its images have that size
+                self._skip(shot, str(error))
             self.progress("predicting", done + 1, max(total, done + 1))
         if not self.names:
             why = self.skipped[0]["reason"] if self.skipped else "it is empty"
