@@ -104,7 +104,7 @@ def test_broken_images_are_notes_unless_all_are(tmp_path: Path) -> None:
     (one,) = data_statistics([folder])["sets"]
     assert one["notes"] == ["1 images do not decode and are left out"]
     (folder / "00001.png").write_bytes(b"")
-    with pytest.raises(DatasetError, match="p: no depth image could be read: .*00000.png"):
+    with pytest.raises(DatasetError, match=r"p: no depth image could be read: .*00000\.png"):
         data_statistics([folder], output=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

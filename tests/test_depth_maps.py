@@ -4,14 +4,17 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
 import threading
-from collections.abc import Iterator
+import time
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from command_line import ENVIRONMENT, call, command, make_long
 from sequences import CAMERA, image_rgb, make_tum, write_image
 
 from slamdepth.datasets import write_camera
@@ -41,13 +44,12 @@ class Ramp:
 
 
 @pytest.fixture(autouse=True)
-def models(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def models(monkeypatch: pytest.MonkeyPatch) -> None:
     SEEN.clear()
     for kind in DepthKind:
         name = f"ramp {kind.value}"
         factory: Any = lambda *, device, seed, n=name, k=kind: Ramp(n, k)  # noqa: E731
         monkeypatch.setitem(registry._factories, name, factory)
-    yield
 
 
 METRIC = f"ramp {DepthKind.METRIC.value}"
@@ -341,3 +343,37 @@ def test_a_full_disk_is_told_after_the_first_image(tmp_path: Path, monkeypatch: 
     with pytest.raises(OutputError, match="GB free; leave out the point clouds"):
         make(photos(tmp_path / "in"), tmp_path / "out")
     assert SEEN == [0]
+
+
+def test_the_command_says_what_it_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+    sequence, out = make_tum(tmp_path / "seq"), tmp_path / "out"
+    done = call("depth", sequence, "--depth", "sensor", "--output", out, "--range", 0, 6, "--no-cloud")
+    assert done.returncode == 0, done.stderr
+    assert "metric, measured by the depth sensor" in done.stdout
+    assert not (out / "cloud").exists()
+    again = call("depth", sequence, "--depth", "sensor", "--output", out, "--stride", 2)
+    assert again.returncode == 2
+    assert "made with 'stride' 1, now 2" in again.stderr
+    assert again.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_is_one_line_and_code_130(number: signal.Signals, tiny_room: Path, tmp_path: Path) -> None:
+    room, out = make_long(tiny_room, tmp_path / "room", repeats=40), tmp_path / "out"
+    process = subprocess.Popen(
+        command("depth", room, "--depth", "sensor", "--output", out, "--no-cloud", "--quiet"),
+        env=ENVIRONMENT,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    journal = out / "frames.jsonl"
+    while process.poll() is None and not (journal.exists() and journal.read_text().count("\n") > 3):
+        time.sleep(0.01)
+    process.send_signal(number)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130, stderr
+    assert stderr.startswith("error: interrupted while predicting: ")
+    assert stderr.count("\n") == 1
+    done = [json.loads(line)["name"] for line in journal.read_text().splitlines()]
+    assert len(list((out / "depth-metres").glob("*.npy"))) == len(done) > 3
