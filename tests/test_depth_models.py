@@ -157,3 +157,16 @@ def test_shipped_model_on_a_real_image(data_dir: Path) -> None:
     # zero-shot: the right order of magnitude and better than a constant
     assert judged.accuracy.metric.abs_rel < 0.5
     assert judged.accuracy.frame_median.delta1 > 0.35
+
+
+def test_the_default_takes_a_head_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[Path | None] = []
+
+    def load(*, head: Path | None, device: str) -> Dinov2Depth:
+        asked.append(head)
+        return tiny_model()
+
+    monkeypatch.setattr(Dinov2Depth, "load", load)
+    create_depth_model("dinov2")
+    create_depth_model("dinov2", weights=tmp_path / "mine.safetensors")
+    assert asked == [None, tmp_path / "mine.safetensors"]

@@ -15,7 +15,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from slamdepth.cli import evaluate, run, synth, train, weights
+from slamdepth.cli import data_stats, depth, evaluate, run, synth, train, weights
 from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_verbose
 from slamdepth.errors import SlamdepthError
 
@@ -34,8 +34,10 @@ app = typer.Typer(
 app.command("run")(run.run_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)
+app.command("depth")(depth.depth_command)
 app.command("eval-depth")(train.eval_depth_command)
 app.command("train-depth")(train.train_depth_command)
+app.command("data-stats")(data_stats.data_stats_command)
 app.add_typer(weights.app, name="weights")
 
 

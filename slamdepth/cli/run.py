@@ -3,20 +3,15 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
+from slamdepth.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
-    from types import FrameType
-
     from slamdepth.config import Config
     from slamdepth.pipeline import RunProgress, RunResult
 
@@ -78,7 +73,7 @@ def run_command(
     from slamdepth.pipeline import RunOptions, run
 
     options = RunOptions(sequence, output, camera, max_frames, stride, not no_mesh, overwrite)
-    with _stop_on_signals() as stop, _ProgressBar(quiet) as bar:
+    with stop_on_signals() as stop, _ProgressBar(quiet) as bar:
         result = run(options, settings, progress=bar.show, stop=stop)
     _print_result(result, quiet)
 
@@ -103,24 +98,6 @@ def _settings(
     if path is None:
         return Config.from_dict(overrides, origin="command line")
     return Config.from_yaml(path, overrides)
-
-
-@contextmanager
-def _stop_on_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set; the second one raises KeyboardInterrupt."""
-    stop = threading.Event()
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class _ProgressBar:

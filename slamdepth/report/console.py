@@ -40,12 +40,12 @@ def run_table(summary: dict[str, Any], places: dict[str, str] | None = None) -> 
     if mesh["vertices"] is not None:
         rows.append(("mesh", f"{count(mesh['vertices'])} vertices, {count(mesh['triangles'])} triangles"))
     rows += list((places or {}).items())
-    return _two_columns(f"{summary['sequence']} · depth: {summary['depth_model']}", rows)
+    return two_columns(f"{summary['sequence']} · depth: {summary['depth_model']}", rows)
 
 
 def trajectory_table(figures: dict[str, Any], title: str = "trajectory", digits: int = 6) -> Table:
     """The figures of ``TrajectoryScore.to_dict()``, lengths with so many digits after the point."""
-    return _two_columns(title, _score_rows(figures, digits))
+    return two_columns(title, _score_rows(figures, digits))
 
 
 def depth_table(figures: dict[str, Any], title: str = "depth against the sensor") -> Table:
@@ -82,7 +82,7 @@ def _score_rows(figures: dict[str, Any], digits: int) -> Rows:
     return rows
 
 
-def _two_columns(title: str, rows: Rows) -> Table:
+def two_columns(title: str, rows: Rows) -> Table:
     """Texts are shown as they are: a path with brackets is no markup."""
     from rich import box
     from rich.table import Table
