@@ -24,6 +24,7 @@ from slamdepth.depth.training.data import Place
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from torch import Tensor
 
     from slamdepth.depth.dinov2 import DinoV2
 
@@ -154,6 +155,20 @@ def encode(
         tokens = torch.stack([grid for grid, _ in tapped], dim=1)
         class_tokens = torch.stack([token for _, token in tapped], dim=1)
     return tokens.half().cpu().numpy(), class_tokens.half().cpu().numpy()
+
+
+def load_batch(
+    cache: FeatureCache, chosen: NDArray[np.int64], device: str
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Tokens, class tokens, normalised images and canonical depth of the samples ``chosen (B,)``."""
+    import torch
+
+    return (
+        torch.from_numpy(cache.tokens[chosen]).to(device).float(),
+        torch.from_numpy(cache.class_tokens[chosen]).to(device).float(),
+        normalised(cache.image_rgb[chosen], device),
+        torch.from_numpy(cache.canonical_m[chosen]).to(device).float(),
+    )
 
 
 def _open_arrays(

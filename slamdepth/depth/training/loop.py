@@ -11,8 +11,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,10 +22,11 @@ from torch import Tensor, nn
 from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2
 from slamdepth.depth.head import DepthHead, HeadEnsemble, HeadShape, save_head
-from slamdepth.depth.preprocess import normalised
-from slamdepth.depth.training.config import SourceConfig, TrainConfig, digest
-from slamdepth.depth.training.data import data_folder, open_place
-from slamdepth.depth.training.features import FeatureCache, build_cache, plan_plain, plan_samples
+from slamdepth.depth.training.caches import judging_cache, training_cache
+from slamdepth.depth.training.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
+from slamdepth.depth.training.config import TrainConfig, digest
+from slamdepth.depth.training.features import FeatureCache, Progress, load_batch
+from slamdepth.depth.training.judge import judge
 from slamdepth.depth.training.losses import total_loss
 from slamdepth.errors import ConfigError, OutputError
 
@@ -36,9 +35,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-Progress = Callable[[str, float], None]
 COARSE = 7
-_JUDGED_VIEWS = 50
 _ONE_SIGMA = 0.6827
 
 
@@ -99,7 +96,7 @@ def train_depth(
     caches = [
         cache
         for source in config.sources
-        if (cache := _training_cache(source, config, backbone, backbone_sha256, device, progress)) is not None
+        if (cache := training_cache(source, config, backbone, backbone_sha256, device, progress)) is not None
     ]
     shape = HeadShape(
         taps, backbone.dim, config.head.dim, config.head.blocks, config.head.guide_dim, config.members
@@ -115,7 +112,7 @@ def train_depth(
     held_out, ratios = {}, []
     for source in config.sources:
         for name in source.held_out:
-            plain = _judging_cache(source, name, config, backbone, backbone_sha256, device, progress)
+            plain = judging_cache(source, name, config, backbone, backbone_sha256, device, progress)
             held_out[name], ratio = judge(ensemble, plain, device)
             ratios.append(ratio)
     ensemble.sigma_scale = config.sigma_scale
@@ -133,92 +130,10 @@ def train_depth(
     try:
         save_head(output, ensemble, about)
         for member in range(config.members):
-            _checkpoint_path(config, member).unlink(missing_ok=True)
+            checkpoint_path(config, member).unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{output}: cannot be written: {error.strerror}") from error
     return TrainResult(output, np.array(losses), held_out, ensemble.sigma_scale)
-
-
-def judge(
-    ensemble: HeadEnsemble, cache: FeatureCache, device: str
-) -> tuple[dict[str, float], NDArray[np.float64]]:
-    """Figures over the samples of ``cache``, and all ``|log error| / sigma``.
-
-    AbsRel as predicted and after a median per view, delta1 after it, the spread of the
-    views' log scales, and the share of errors below one sigma.
-    """
-    rows: list[list[float]] = []
-    ratios = []
-    for k in range(len(cache)):
-        batch = _batch(cache, np.array([k]), device)
-        with torch.inference_mode():
-            log_depth, sigma = ensemble(*batch[:3])
-        known = batch[3][0] > 0
-        if int(known.sum()) < 100:
-            continue
-        error = (log_depth[0][known] - batch[3][0][known].log()).double().cpu().numpy()
-        ratios.append(np.abs(error) / sigma[0][known].double().cpu().numpy())
-        median = float(np.median(error))
-        scaled = np.exp(error - median)
-        rows.append([
-            float(np.mean(np.abs(np.exp(error) - 1))),
-            float(np.mean(np.abs(scaled - 1))),
-            float(np.mean(np.maximum(scaled, 1 / scaled) < 1.25)),
-            median,
-        ])  # fmt: skip
-    if not rows:
-        return {}, np.ones(1)
-    table = np.array(rows)
-    ratio = np.concatenate(ratios)
-    return {
-        "abs_rel": float(table[:, 0].mean()),
-        "abs_rel_frame_median": float(table[:, 1].mean()),
-        "delta1_frame_median": float(table[:, 2].mean()),
-        "scale_spread": float(table[:, 3].std()),
-        "within_one_sigma": float(np.mean(ratio < 1)),
-    }, ratio
-
-
-def _training_cache(
-    source: SourceConfig,
-    config: TrainConfig,
-    backbone: DinoV2,
-    backbone_sha256: str,
-    device: str,
-    progress: Progress | None,
-) -> FeatureCache | None:
-    if not source.places:
-        return None
-    folder = data_folder(source.folder)
-    places = [open_place(folder / place.name) for place in source.places]
-    samples = [place.samples for place in source.places]
-    keys = plan_samples(places, samples, config.seed)[: source.limit]
-    where = _cache_folder(config, backbone_sha256, source.places, source.limit, [len(p) for p in places])
-    return build_cache(
-        where, places, keys, config.view, backbone, config.head.taps, config.seed,
-        device=device, progress=progress,
-    )  # fmt: skip
-
-
-def _judging_cache(
-    source: SourceConfig,
-    name: str,
-    config: TrainConfig,
-    backbone: DinoV2,
-    backbone_sha256: str,
-    device: str,
-    progress: Progress | None,
-) -> FeatureCache:
-    place = open_place(data_folder(source.folder) / name)
-    where = _cache_folder(config, backbone_sha256, "plain", name, len(place))
-    return build_cache(
-        where, [place], plan_plain(0, place, _JUDGED_VIEWS), config.view, backbone, config.head.taps,
-        config.seed, device=device, progress=progress,
-    )  # fmt: skip
-
-
-def _cache_folder(config: TrainConfig, *more: object) -> Path:
-    return store.cache_dir() / "features" / digest(config.view, config.head.taps, config.seed, *more)
 
 
 def _train_member(
@@ -236,26 +151,22 @@ def _train_member(
         optimiser = torch.optim.AdamW(
             head.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
-        path, key = _checkpoint_path(config, member), digest(config, member)
+        path, key = checkpoint_path(config, member), digest(config, member)
         history: list[float] = []
-        if path.is_file():
-            state = torch.load(path, map_location=device, weights_only=True)
-            if state["key"] == key:
-                head.load_state_dict(state["head"])
-                optimiser.load_state_dict(state["optimiser"])
-                history = list(state["history"])
-                logger.info("going on from epoch %d of %s", len(history), path)
+        if (state := load_checkpoint(path, key, device)) is not None:
+            head.load_state_dict(state["head"])
+            optimiser.load_state_dict(state["optimiser"])
+            history = list(state["history"])
+            logger.info("going on from epoch %d of %s", len(history), path)
         epochs = config.coarse_epochs + config.fine_epochs
         for epoch in range(len(history), epochs):
             torch.manual_seed(seed + 1_000_003 * (epoch + 1))  # so that a resumed epoch drops the same
             history.append(_epoch(config, caches, head, optimiser, epoch, seed, device))
-            partial = path.with_name(path.name + ".partial")
-            torch.save(
+            save_checkpoint(
+                path,
                 {"key": key, "head": head.state_dict(), "optimiser": optimiser.state_dict(),
                  "history": history},
-                partial,
             )  # fmt: skip
-            os.replace(partial, path)
             logger.info("member %d epoch %d: loss %.4f", member, epoch, history[-1])
             tell(f"member {member + 1}: loss {history[-1]:.4f}", (epoch + 1) / epochs)
     return head.eval(), history
@@ -279,7 +190,7 @@ def _epoch(
     for step in range(steps):
         chosen = samples[np.sort(order[step * config.batch : (step + 1) * config.batch])]
         parts = [
-            _batch(cache, chosen[chosen[:, 0] == c, 1], device)
+            load_batch(cache, chosen[chosen[:, 0] == c, 1], device)
             for c, cache in enumerate(caches)
             if (chosen[:, 0] == c).any()
         ]
@@ -317,19 +228,3 @@ def coarse_target(target: Tensor) -> Tensor:
     blocks = blocks.permute(0, 1, 3, 2, 4).flatten(3)
     known = torch.where(blocks > 0, blocks, torch.nan)
     return known.nanmedian(dim=-1).values.nan_to_num(0.0)
-
-
-def _batch(
-    cache: FeatureCache, chosen: NDArray[np.int64], device: str
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return (
-        torch.from_numpy(cache.tokens[chosen]).to(device).float(),
-        torch.from_numpy(cache.class_tokens[chosen]).to(device).float(),
-        normalised(cache.image_rgb[chosen], device),
-        torch.from_numpy(cache.canonical_m[chosen]).to(device).float(),
-    )
-
-
-def _checkpoint_path(config: TrainConfig, member: int) -> Path:
-    output = Path(config.output)
-    return output.with_name(f"{output.name}.member{member}.checkpoint")
