@@ -19,6 +19,7 @@ from slamdepth.depth.training.config import AugmentConfig, TrainConfig
 from slamdepth.depth.training.data import data_folder, open_place
 from slamdepth.depth.training.features import plan_samples
 from slamdepth.depth.training.losses import laplace_nll, multiscale_gradient, scale_invariant
+from slamdepth.depth.training.stages import coarse_target
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.types import Camera, Frame
 
@@ -186,9 +187,9 @@ def test_reading_places(tmp_path: Path) -> None:
 def test_bad_places_are_named(tmp_path: Path) -> None:
     folder = make_place(tmp_path / "room")
     with pytest.raises(DatasetError, match=r"no camera\.json"):
-        open_place(tmp_path)
+        open_place(tmp_path, "pairs")
     (folder / "00001.png").write_bytes(b"x")
-    with pytest.raises(DatasetError, match=r"00001\.png: does not decode"):
+    with pytest.raises(DatasetError, match=r"00001\.png: the image does not decode"):
         open_place(folder).read(1)
     cv2.imwrite(str(folder / "00002.png"), np.ones((5, 5), np.uint16))
     with pytest.raises(DatasetError, match=r"00002\.png.*camera\.json says"):
@@ -196,7 +197,7 @@ def test_bad_places_are_named(tmp_path: Path) -> None:
     (folder / "camera.json").write_text('{"width": 64}')
     with pytest.raises(DatasetError, match=r"camera\.json: the key 'height' is missing"):
         open_place(folder)
-    with pytest.raises(DatasetError, match="no such folder of training pairs"):
+    with pytest.raises(DatasetError, match="no such folder of training data"):
         data_folder(str(tmp_path / "absent"))
 
 
@@ -293,4 +294,4 @@ def test_coarse_target_is_the_median_of_what_is_known() -> None:
     target = torch.zeros(1, 14, 7)
     target[0, :2, :3] = 1.0
     target[0, 0, 5] = 9.0
-    torch.testing.assert_close(loop.coarse_target(target), torch.tensor([[[1.0], [0.0]]]))
+    torch.testing.assert_close(coarse_target(target), torch.tensor([[[1.0], [0.0]]]))

@@ -3,60 +3,109 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2
-from slamdepth.depth.training.config import SourceConfig, TrainConfig, digest
-from slamdepth.depth.training.data import data_folder, open_place
+from slamdepth.depth.training.config import TrainConfig, digest
+from slamdepth.depth.training.data import Place, PlaceReader, data_folder, open_place
 from slamdepth.depth.training.features import (
     FeatureCache,
-    Progress,
+    SampleKey,
     build_cache,
     plan_plain,
     plan_samples,
 )
+from slamdepth.depth.training.progress import Progress, silent
+from slamdepth.errors import ConfigError
 
 _JUDGED_VIEWS = 50
+_VIEW_VERSION = 2
+"""Counts up where the same settings make other views or features."""
 
 
-def training_cache(
-    source: SourceConfig,
+@dataclass(frozen=True)
+class PlannedCache:
+    """One cache before it is filled: a source's samples, or the plain views of a held-out place.
+
+    Attributes:
+        folder: where it is kept; its name hashes all that decides on its content.
+        keys: its samples, in order.
+        held_out: name of the place where it is for judging, else None.
+    """
+
+    folder: Path
+    places: tuple[Place, ...]
+    keys: tuple[SampleKey, ...]
+    held_out: str | None = None
+
+
+def plan_caches(
+    config: TrainConfig, backbone_sha256: str, readers: Mapping[str, PlaceReader] | None = None
+) -> list[PlannedCache]:
+    """Open every place of ``config`` and say what is to be computed of it.
+
+    Args:
+        backbone_sha256: of the file whose features they are.
+        readers: readers beside those of :mod:`slamdepth.depth.training.readers`.
+
+    Raises:
+        ConfigError: a place is both trained on and held out, or none is trained on.
+        DatasetError: a place is missing or malformed.
+    """
+    trained = {(s.folder, place.name) for s in config.sources for place in s.places}
+    both = trained & {(s.folder, name) for s in config.sources for name in s.held_out}
+    if both:
+        raise ConfigError(f"setting 'sources': {min(both)[1]} is held out and also trained on")
+    if not trained:
+        raise ConfigError("setting 'sources': there is no place to train on")
+
+    def where(places: tuple[Place, ...], *more: object) -> Path:
+        made_of = [place.fingerprint for place in places]
+        name = digest(
+            config.view, _VIEW_VERSION, config.head.taps, config.seed, backbone_sha256, made_of, *more
+        )
+        return store.cache_dir() / "features" / name
+
+    planned = []
+    for source in config.sources:
+        if not source.places:
+            continue
+        folder = data_folder(source.folder)
+        places = tuple(open_place(folder / place.name, source.reader, readers) for place in source.places)
+        keys = plan_samples(places, [place.samples for place in source.places], config.seed)[: source.limit]
+        planned.append(PlannedCache(where(places, source.places, source.limit), places, tuple(keys)))
+    for source in config.sources:
+        for name in source.held_out:
+            place = open_place(data_folder(source.folder) / name, source.reader, readers)
+            keys = plan_plain(0, place, _JUDGED_VIEWS)
+            planned.append(PlannedCache(where((place,), "plain"), (place,), tuple(keys), name))
+    return planned
+
+
+def fill_cache(
+    planned: PlannedCache,
     config: TrainConfig,
     backbone: DinoV2,
-    backbone_sha256: str,
-    device: str,
-    progress: Progress | None,
-) -> FeatureCache | None:
-    if not source.places:
-        return None
-    folder = data_folder(source.folder)
-    places = [open_place(folder / place.name) for place in source.places]
-    samples = [place.samples for place in source.places]
-    keys = plan_samples(places, samples, config.seed)[: source.limit]
-    where = _cache_folder(config, backbone_sha256, source.places, source.limit, [len(p) for p in places])
-    return build_cache(
-        where, places, keys, config.view, backbone, config.head.taps, config.seed,
-        device=device, progress=progress,
-    )  # fmt: skip
-
-
-def judging_cache(
-    source: SourceConfig,
-    name: str,
-    config: TrainConfig,
-    backbone: DinoV2,
-    backbone_sha256: str,
-    device: str,
-    progress: Progress | None,
+    *,
+    device: str = "cpu",
+    progress: Progress = silent,
+    stage: str = "features",
 ) -> FeatureCache:
-    place = open_place(data_folder(source.folder) / name)
-    where = _cache_folder(config, backbone_sha256, "plain", name, len(place))
+    """Compute what is missing of ``planned``; errors of :func:`build_cache`."""
     return build_cache(
-        where, [place], plan_plain(0, place, _JUDGED_VIEWS), config.view, backbone, config.head.taps,
-        config.seed, device=device, progress=progress,
+        planned.folder, planned.places, planned.keys, config.view, backbone, config.head.taps, config.seed,
+        device=device, progress=progress, stage=stage,
     )  # fmt: skip
 
 
-def _cache_folder(config: TrainConfig, *more: object) -> Path:
-    return store.cache_dir() / "features" / digest(config.view, config.head.taps, config.seed, *more)
+def benchmarks_seen(planned: list[PlannedCache]) -> dict[str, tuple[str, ...]]:
+    """The benchmarks a head trained on ``planned`` has seen, each with the places of it."""
+    seen: dict[str, tuple[str, ...]] = {}
+    for cache in planned:
+        for place in cache.places if cache.held_out is None else ():
+            if place.benchmark is not None:
+                seen[place.benchmark] = (*seen.get(place.benchmark, ()), place.name)
+    return seen
