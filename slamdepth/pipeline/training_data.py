@@ -18,7 +18,7 @@ from slamdepth.depth.training.data import PlaceReader, fingerprint
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.types import Camera, Frame
 
-_BENCHMARKS = {"tum": "the TUM RGB-D layout", "7scenes": "7-Scenes"}
+_BENCHMARKS = {"tum": "sequences in the TUM RGB-D layout", "7scenes": "7-Scenes sequences"}
 """What a head trained on a layout has seen; a recording of one's own in it counts too."""
 
 

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 _DPI = 120
 _COLOURS = ("#17458f", "#c8502b", "#2f9e4f", "#8a4fb0", "#b58a00", "#11787f")
-_SIGMA_PERCENTILE = 98
 _README = """What a training of a depth head left here.
 
 losses.png     loss of every epoch, member by member: solid on the views trained on, dashed on
                the held-out places. Left of the grey line the head is judged at 1/7 of the
-               resolution, right of it at all of it; the two are other numbers.
+               resolution, right of it at all of it; the two are other numbers. Views trained on
+               are distorted and seen with dropout, held-out ones are not, so theirs can be lower.
                Below it, AbsRel on the held-out places after one median a view.
 samples.png    views as the network saw them, what the sensor measured, what the finished head
                predicts and how unsure it is of it (deviation of the log of depth, so 0.1 is
@@ -117,11 +117,11 @@ def draw_samples(path: Path, samples: tuple[SampleView, ...]) -> None:
     rows, columns = samples[0].image_rgb.shape[:2]
     width = 11.5
     figure, axes = _new_figure(
-        width, 0.4 + len(samples) * (0.21 * width * rows / columns + 0.28), len(samples), 4
+        width, 0.4 + len(samples) * (0.195 * width * rows / columns + 0.2), len(samples), 4
     )
     depth_colours = LinearSegmentedColormap.from_list("depth", NEAR_TO_FAR)
     depth_colours.set_bad(UNKNOWN)
-    most_unsure = max(0.05, *(float(np.percentile(s.sigma_log, _SIGMA_PERCENTILE)) for s in samples))
+    surest, most_unsure = np.percentile(np.concatenate([s.sigma_log.ravel() for s in samples]), (2, 98))
     for row, sample in zip(axes, samples, strict=True):
         known = sample.sensor_m[sample.sensor_m > 0]
         both = np.concatenate([known, sample.predicted_m.ravel()])
@@ -130,7 +130,7 @@ def draw_samples(path: Path, samples: tuple[SampleView, ...]) -> None:
         row[1].imshow(colour_depth(sample.sensor_m, near_m, far_m), interpolation="nearest")
         row[2].imshow(colour_depth(sample.predicted_m, near_m, far_m), interpolation="nearest")
         unsure = row[3].imshow(
-            sample.sigma_log, cmap="magma", vmin=0, vmax=most_unsure, interpolation="nearest"
+            sample.sigma_log, cmap="magma", vmin=surest, vmax=most_unsure, interpolation="nearest"
         )
         scale = ScalarMappable(Normalize(near_m, far_m), depth_colours)
         figure.colorbar(scale, ax=row[2], shrink=0.85, label="m")

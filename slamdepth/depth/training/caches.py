@@ -55,10 +55,12 @@ def plan_caches(
         ConfigError: a place is both trained on and held out, or none is trained on.
         DatasetError: a place is missing or malformed.
     """
-    trained = {(s.folder, place.name) for s in config.sources for place in s.places}
-    both = trained & {(s.folder, name) for s in config.sources for name in s.held_out}
-    if both:
-        raise ConfigError(f"setting 'sources': {min(both)[1]} is held out and also trained on")
+    roots = [data_folder(source.folder) for source in config.sources]
+    both = list(zip(roots, config.sources, strict=True))
+    trained = {(root / place.name).resolve() for root, source in both for place in source.places}
+    judged = {(root / name).resolve() for root, source in both for name in source.held_out}
+    if trained & judged:
+        raise ConfigError(f"setting 'sources': {min(trained & judged).name} is held out and also trained on")
     if not trained:
         raise ConfigError("setting 'sources': there is no place to train on")
 
@@ -70,16 +72,15 @@ def plan_caches(
         return store.cache_dir() / "features" / name
 
     planned = []
-    for source in config.sources:
+    for folder, source in both:
         if not source.places:
             continue
-        folder = data_folder(source.folder)
         places = tuple(open_place(folder / place.name, source.reader, readers) for place in source.places)
         keys = plan_samples(places, [place.samples for place in source.places], config.seed)[: source.limit]
         planned.append(PlannedCache(where(places, source.places, source.limit), places, tuple(keys)))
-    for source in config.sources:
+    for folder, source in both:
         for name in source.held_out:
-            place = open_place(data_folder(source.folder) / name, source.reader, readers)
+            place = open_place(folder / name, source.reader, readers)
             keys = plan_plain(0, place, _JUDGED_VIEWS)
             planned.append(PlannedCache(where((place,), "plain"), (place,), tuple(keys), name))
     return planned

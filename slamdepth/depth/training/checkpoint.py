@@ -48,7 +48,8 @@ def load_checkpoint(path: Path, key: str, device: str) -> dict[str, Any] | None:
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
-        logger.warning("%s: damaged, so this member starts again: %s", path, str(error).splitlines()[0])
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        logger.warning("%s: damaged, so this member starts again: %s", path, reason)
         return None
     if not isinstance(state, dict) or state.get("key") != key:
         logger.warning("%s: of a training with other settings or data; this one starts afresh", path)
