@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -92,3 +93,26 @@ def make_hypersim(folder: Path, count: int = 2, width: int = 128, height: int = 
                 file["dataset"] = distance.astype(np.float16)
     (folder / "images" / "scene_cam_01_final_preview" / "frame.0001.color.jpg").unlink()
     return folder
+
+
+def tiny_settings(folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Settings of a training of seconds, with a place held out; its cache is below ``folder``."""
+    monkeypatch.setenv("SLAMDEPTH_CACHE", str(folder / "cache"))
+    make_place(folder / "data" / "room")
+    make_place(folder / "data" / "other", 2)
+    return {
+        "output": str(folder / "head.safetensors"),
+        "members": 2,
+        "coarse_epochs": 2,
+        "fine_epochs": 1,
+        "batch": 4,
+        "sources": [
+            {
+                "folder": str(folder / "data"),
+                "places": [{"name": "room", "samples": 8}],
+                "held_out": ["other"],
+            },
+        ],
+        "view": {"rows": 28, "columns": 42},
+        "head": {"taps": [0, 1], "dim": 16, "guide_dim": 8},
+    }

@@ -141,6 +141,7 @@ def build_cache(
                 focal_factor=factors,
             )
             progress(TrainStep(stage, count, len(groups)))
+        store.commit()
     arrays = store.arrays
     place = np.array([key.place for key in keys], dtype=np.int64)
     return FeatureCache(

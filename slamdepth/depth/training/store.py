@@ -12,6 +12,7 @@ import json
 import logging
 import os
 import shutil
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +27,7 @@ logger = logging.getLogger(__name__)
 
 _NOTE = "shapes.json"
 _SPARE_BYTES = 64 << 20
+_COMMIT_EVERY_S = 2.0
 
 Spec = tuple[tuple[int, ...], type]
 """Shape of one sample and its type."""
@@ -71,6 +73,8 @@ class SampleStore:
             )
             for name, (shape, kind) in _all(specs).items()
         }
+        self._written: list[range] = []
+        self._committed_at_s = time.monotonic()
         if is_fresh:  # last: where it stands, every file is there in full length
             write_text(folder / _NOTE, _shapes(count, specs))
 
@@ -81,13 +85,25 @@ class SampleStore:
         return [group for group in groups if not done[group.start : group.stop].all()]
 
     def put(self, group: range, **values: Any) -> None:
-        """Write the samples ``group`` of every array, ``(len(group), ...)`` each, and mark them done."""
+        """Write the samples ``group`` of every array, ``(len(group), ...)`` each; they count as done
+        after the next :meth:`commit`, which comes by itself every few seconds."""
         for name, value in values.items():
             self.arrays[name][group.start : group.stop] = value
-        for name in values:
-            self.arrays[name].flush()
-        self.arrays["done"][group.start : group.stop] = 1
-        self.arrays["done"].flush()
+        self._written.append(group)
+        if time.monotonic() - self._committed_at_s > _COMMIT_EVERY_S:
+            self.commit()
+
+    def commit(self) -> None:
+        """Wait until everything written is on the disk, then mark it done."""
+        if self._written:
+            for name, array in self.arrays.items():
+                if name != "done":
+                    array.flush()
+            for group in self._written:
+                self.arrays["done"][group.start : group.stop] = 1
+            self.arrays["done"].flush()
+        self._written.clear()
+        self._committed_at_s = time.monotonic()
 
 
 @contextmanager
