@@ -19,33 +19,50 @@ if TYPE_CHECKING:
 def train_depth_command(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file that describes the training.")],
     device: Annotated[str, typer.Option(metavar="cpu|cuda", help="Where to train.")] = "cpu",
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Tell samples, disk space and time, and train nothing.")
+    ] = False,
+    search: Annotated[
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Tune the settings under 'search' until N trials are done; then stop."
+        ),
+    ] = None,
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Train a depth head on the DINOv2 backbone's features.
 
-    Example: slamdepth train-depth slamdepth/depth/configs/dinov2_head.yaml
+    Example: slamdepth train-depth slamdepth/depth/configs/dinov2_head.yaml --dry-run
 
-    A training that was killed goes on where it stopped, to the same result.
+    A training or search that was killed goes on where it stopped, to the same result.
+
+    Loss curves, sample predictions and figures go into a folder beside the head.
     """
     show_log()
-    from rich.progress import Progress
-
+    from slamdepth.cli.train_show import plan_lines, plan_table, training_bars, trials_table
     from slamdepth.depth.training.config import TrainConfig
+    from slamdepth.pipeline.training import plan_run, report_folder, run_search, run_training
 
     settings = TrainConfig.from_yaml(config)
-    from slamdepth.depth.training.loop import train_depth
-
-    err = error_console()
-    with Progress(console=err, disable=quiet or not err.is_terminal) as bar:
-        task = bar.add_task("starting", total=1.0)
-        result = train_depth(
-            settings,
-            device=device,
-            progress=lambda what, share: bar.update(task, completed=share, description=what),
-        )
     out = console()
-    out.print(f"head: {result.output}", markup=False)
+    if dry_run:
+        plan = plan_run(settings, device=device)
+        out.print(plan_table(plan))
+        for line in plan_lines(plan):
+            out.print(line, markup=False, soft_wrap=True)
+        return
+    if search is not None:
+        with training_bars(quiet) as progress:
+            found = run_search(settings, search, device=device, progress=progress)
+        out.print(trials_table(found))
+        out.print(f"best settings: {found.best_config}", markup=False, soft_wrap=True)
+        out.print(f"study: {found.study}", markup=False, soft_wrap=True)
+        return
+    with training_bars(quiet) as progress:
+        result = run_training(settings, device=device, progress=progress)
+    out.print(f"head: {result.output}", markup=False, soft_wrap=True)
+    out.print(f"curves and samples: {report_folder(result.output)}", markup=False, soft_wrap=True)
     for place, figures in result.held_out.items():
         shown = ", ".join(f"{name} {value:.3f}" for name, value in figures.items())
         out.print(f"held out {place}: {shown}", markup=False)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.depth.training.config import AugmentConfig
+from slamdepth.depth.training.lens import raw_pixels
 from slamdepth.geometry import so3_exp
 from slamdepth.types import Frame
 
@@ -72,6 +73,7 @@ def turned_view(
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], float]:
     """Image, depth and focal length (px) of ``frame`` after an exact camera rotation.
 
+    The view is that of a pinhole: lens distortion of ``frame.camera`` is undone.
     Pixels from outside the frame mirror its border and have depth 0.
     """
     import cv2
@@ -87,7 +89,7 @@ def turned_view(
     u, v = np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64))
     rays_view = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K_view).T
     rays = rays_view @ R_camera_view.T
-    pixels = (rays / rays[..., 2:]) @ camera.K.T
+    pixels = raw_pixels(rays, camera)
     map_x, map_y = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
     image: NDArray[Any] = cv2.remap(
         frame.image_rgb, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101

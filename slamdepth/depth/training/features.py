@@ -2,18 +2,17 @@
 """Backbone features of augmented views, computed once and kept on disk.
 
 The backbone is frozen, so a view's tokens never change; what a training costs is this
-cache. It grows sample by sample and continues where a killed run stopped.
+cache. It grows by a few samples at a time and continues where a killed run stopped.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import zlib
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,15 +20,16 @@ from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, normalised
 from slamdepth.depth.training.augment import View, augmented_view, plain_view
 from slamdepth.depth.training.config import ViewConfig
 from slamdepth.depth.training.data import Place
+from slamdepth.depth.training.progress import Progress, TrainStep, silent
+from slamdepth.depth.training.store import SampleStore, Spec, locked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from torch import Tensor
 
     from slamdepth.depth.dinov2 import DinoV2
 
 logger = logging.getLogger(__name__)
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class FeatureCache:
         return len(self.place)
 
 
-def plan_samples(places: list[Place], samples: list[int], seed: int) -> list[SampleKey]:
+def plan_samples(places: Sequence[Place], samples: Sequence[int], seed: int) -> list[SampleKey]:
     """Which views to make: each place's number spread over its frames, in random order.
 
     A place with more frames than samples is thinned evenly; one with fewer is shown
@@ -91,10 +91,22 @@ def plan_plain(place_index: int, place: Place, limit: int) -> list[SampleKey]:
     return [SampleKey(place_index, int(frame), -1) for frame in chosen]
 
 
+def sample_specs(config: ViewConfig, taps: tuple[int, ...], dim: int, patch: int) -> dict[str, Spec]:
+    """Shape and type of each array of one sample, for a backbone of ``dim`` channels."""
+    rows, columns = config.rows, config.columns
+    return {
+        "tokens": ((len(taps), dim, rows // patch, columns // patch), np.float16),
+        "class_tokens": ((len(taps), dim), np.float16),
+        "image_rgb": ((rows, columns, 3), np.uint8),
+        "canonical_m": ((rows, columns), np.float16),
+        "focal_factor": ((), np.float32),
+    }
+
+
 def build_cache(
     folder: Path,
-    places: list[Place],
-    keys: list[SampleKey],
+    places: Sequence[Place],
+    keys: Sequence[SampleKey],
     config: ViewConfig,
     backbone: DinoV2,
     taps: tuple[int, ...],
@@ -102,30 +114,35 @@ def build_cache(
     *,
     device: str = "cpu",
     batch: int = 4,
-    progress: Progress | None = None,
+    progress: Progress = silent,
+    stage: str = "features",
 ) -> FeatureCache:
-    """Fill (or finish filling) the cache in ``folder`` and open it."""
-    tell = progress or (lambda what, share: None)
-    arrays = _open_arrays(folder, len(keys), config, backbone, taps)
-    done = arrays["done"]
-    todo = [k for k in range(len(keys)) if not done[k]]
-    if todo:
-        logger.info("computing %d of %d samples into %s", len(todo), len(keys), folder)
-    for start in range(0, len(todo), batch):
-        chosen = todo[start : start + batch]
-        views = [make_view(places, keys[k], config, seed) for k in chosen]
-        tokens, class_tokens = encode([view.image_rgb for view in views], backbone, taps, device)
-        for row, k in enumerate(chosen):
-            view = views[row]
-            factor = view.focal_px / CANONICAL_FOCAL_PX
-            known = (view.depth_m >= config.min_depth_m) & (view.depth_m <= config.max_depth_m)
-            arrays["tokens"][k] = tokens[row]
-            arrays["class_tokens"][k] = class_tokens[row]
-            arrays["image_rgb"][k] = view.image_rgb
-            arrays["canonical_m"][k] = np.where(known, view.depth_m / factor, 0.0)
-            arrays["focal_factor"][k] = factor
-            done[k] = 1
-        tell("computing features", (start + len(chosen)) / len(todo))
+    """Fill (or finish filling) the cache in ``folder`` and open it.
+
+    Raises:
+        DatasetError: an image or its depth cannot be read.
+        OutputError: the folder cannot be written or the disk is too small.
+    """
+    with locked(folder):
+        store = SampleStore(folder, len(keys), sample_specs(config, taps, backbone.dim, backbone.patch))
+        groups = store.groups_to_do(batch)
+        if groups:
+            logger.info("computing %d of %d samples into %s", sum(map(len, groups)), len(keys), folder)
+        for count, group in enumerate(groups, start=1):
+            views = [make_view(places, keys[k], config, seed) for k in group]
+            tokens, class_tokens = encode([view.image_rgb for view in views], backbone, taps, device)
+            factors = [view.focal_px / CANONICAL_FOCAL_PX for view in views]
+            store.put(
+                group,
+                tokens=tokens,
+                class_tokens=class_tokens,
+                image_rgb=np.stack([view.image_rgb for view in views]),
+                canonical_m=np.stack([_canonical(v, f, config) for v, f in zip(views, factors, strict=True)]),
+                focal_factor=factors,
+            )
+            progress(TrainStep(stage, count, len(groups)))
+        store.commit()
+    arrays = store.arrays
     place = np.array([key.place for key in keys], dtype=np.int64)
     return FeatureCache(
         arrays["tokens"], arrays["class_tokens"], arrays["image_rgb"], arrays["canonical_m"],
@@ -133,7 +150,12 @@ def build_cache(
     )  # fmt: skip
 
 
-def make_view(places: list[Place], key: SampleKey, config: ViewConfig, seed: int) -> View:
+def _canonical(view: View, factor: float, config: ViewConfig) -> NDArray[np.float32]:
+    known = (view.depth_m >= config.min_depth_m) & (view.depth_m <= config.max_depth_m)
+    return np.where(known, view.depth_m / np.float32(factor), 0.0).astype(np.float32)
+
+
+def make_view(places: Sequence[Place], key: SampleKey, config: ViewConfig, seed: int) -> View:
     """The view ``key`` names; the same for the same seed whatever else is made."""
     place = places[key.place]
     frame = place.read(key.frame)
@@ -156,29 +178,15 @@ def encode(
     return tokens.half().cpu().numpy(), class_tokens.half().cpu().numpy()
 
 
-def _open_arrays(
-    folder: Path, count: int, config: ViewConfig, backbone: DinoV2, taps: tuple[int, ...]
-) -> dict[str, Any]:
-    folder.mkdir(parents=True, exist_ok=True)
-    rows, columns = config.rows, config.columns
-    h, w = rows // backbone.patch, columns // backbone.patch
-    shapes: dict[str, tuple[tuple[int, ...], type]] = {
-        "tokens": ((count, len(taps), backbone.dim, h, w), np.float16),
-        "class_tokens": ((count, len(taps), backbone.dim), np.float16),
-        "image_rgb": ((count, rows, columns, 3), np.uint8),
-        "canonical_m": ((count, rows, columns), np.float16),
-        "focal_factor": ((count,), np.float32),
-        "done": ((count,), np.uint8),
-    }
-    note = folder / "shapes.json"
-    text = json.dumps({name: list(shape) for name, (shape, _) in shapes.items()})
-    fresh = not note.is_file() or note.read_text(encoding="utf-8") != text
-    arrays = {
-        name: np.lib.format.open_memmap(
-            folder / f"{name}.npy", mode="w+" if fresh else "r+", dtype=dtype, shape=shape if fresh else None
-        )
-        for name, (shape, dtype) in shapes.items()
-    }
-    if fresh:
-        note.write_text(text, encoding="utf-8")
-    return arrays
+def load_batch(
+    cache: FeatureCache, chosen: NDArray[np.int64], device: str
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Tokens, class tokens, normalised images and canonical depth of the samples ``chosen (B,)``."""
+    import torch
+
+    return (
+        torch.from_numpy(cache.tokens[chosen]).to(device).float(),
+        torch.from_numpy(cache.class_tokens[chosen]).to(device).float(),
+        normalised(cache.image_rgb[chosen], device),
+        torch.from_numpy(cache.canonical_m[chosen]).to(device).float(),
+    )

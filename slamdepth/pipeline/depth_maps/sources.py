@@ -19,7 +19,7 @@ from slamdepth.datasets.intrinsics import Certainty, Intrinsics, find_camera_fil
 from slamdepth.datasets.pictures import IMAGE_ENDINGS, list_images, read_picture, short_names
 from slamdepth.datasets.sequence import check_size
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
-from slamdepth.depth.training.data import Place, open_place
+from slamdepth.depth.training.readers.pairs import PairPlace, PairReader
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.types import Camera, Frame
 
@@ -104,7 +104,7 @@ def open_source(
             if any(reader.matches(path) for reader in known_readers()):
                 return _SequenceSource(open_dataset(path, camera_file), chosen, with_depth)
             if (path / "camera.json").is_file():
-                return _PairSource(open_place(path), camera_file, chosen)
+                return _PairSource(PairReader().open(path), camera_file, chosen)
             return _PictureSource(SourceKind.IMAGES, path, list_images(path)[chosen], camera_file)
         if not path.exists():
             raise DatasetError(f"{path}: no such file or folder")
@@ -184,7 +184,7 @@ class _PairSource:
     has_depth = True
     stamp = ""
 
-    def __init__(self, place: Place, camera_file: Path | None, chosen: slice) -> None:
+    def __init__(self, place: PairPlace, camera_file: Path | None, chosen: slice) -> None:
         self.name = place.name
         self.notes: list[str] = []
         self._place = place
