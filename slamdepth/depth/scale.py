@@ -29,7 +29,7 @@ _GRID = 4
 _SENSOR_M = (0.1, 10.0)
 _FEWEST_PIXELS = 50
 _MOST_SAMPLES = 20_000
-_RESAMPLES = 300
+_RESAMPLES = 200
 
 
 class ScaleDomain(str, Enum):

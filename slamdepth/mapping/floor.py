@@ -139,7 +139,7 @@ def _plane(
     """The level plane below the world's origin that most points lie on (RANSAC, then least squares)."""
     if len(points) < _MIN_POINTS:
         return None
-    thin = slice(None, None, max(1, len(points) // 5000))
+    thin = slice(None, None, max(1, len(points) // 3000))
     some, some_normals = points[thin], normals[thin]
     best, most = None, 0
     for three in rng.integers(0, len(some), (_TRIALS, 3)):
