@@ -54,7 +54,10 @@ def test_a_constant_prior_tracks_every_frame_up_to_scale(constant_run: tuple[Run
     run, reconstruction = constant_run
     assert run.statuses() == {TrackingStatus.TRACKING: COUNT}
     assert ate_m(reconstruction.trajectory, with_scale=True) < 0.02
-    assert any("scale" in note for note in reconstruction.notes)
+    votes = reconstruction.scale_votes
+    assert 2 <= len(votes) <= len(reconstruction.keyframes)
+    assert abs(np.median(votes)) < 1e-9
+    assert np.std(votes) > 0.01
 
 
 def test_the_reconstruction_is_consistent(

@@ -15,7 +15,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from slamdepth.cli import data_stats, depth, evaluate, run, synth, train, weights
+from slamdepth.cli import data_stats, depth, evaluate, run, scale, synth, train, weights
 from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_verbose
 from slamdepth.errors import SlamdepthError
 
@@ -32,6 +32,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("run")(run.run_command)
+app.command("scale")(scale.scale_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)
 app.command("depth")(depth.depth_command)

@@ -35,6 +35,28 @@ def run_command(
         str | None,
         typer.Option(metavar="dinov2|sensor", help="Where depth comes from. Default: dinov2"),
     ] = None,
+    depth_weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Weights file of the depth model.")
+    ] = None,
+    depth_scale: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|X|groundtruth",
+            help="Multiply predicted depth: by a file of 'slamdepth scale', by a number, or by what this "
+            "sequence's ground truth says.",
+        ),
+    ] = None,
+    camera_height: Annotated[
+        float | None, typer.Option(metavar="M", help="First camera's height over the floor in metres.")
+    ] = None,
+    baseline_m: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="Distance in metres from the first camera to the last; see next."),
+    ] = None,
+    baseline_between: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="T1 T2", help="Seconds of the sequence that --baseline-m is between."),
+    ] = None,
     odometry: Annotated[
         str | None,
         typer.Option(metavar="orb|kiss-icp", help="What estimates the motion. Default: orb"),
@@ -69,7 +91,22 @@ def run_command(
 
     Ctrl-C finishes the run with the frames it has; a second Ctrl-C breaks it off.
     """
-    settings = _settings(config, depth, odometry, voxel_size, device, seed)
+    settings = _settings(
+        config,
+        {
+            "odometry": odometry,
+            "device": device,
+            "seed": seed,
+            "depth": {"name": depth, "weights": None if depth_weights is None else str(depth_weights)},
+            "scale": {
+                "depth": depth_scale,
+                "camera_height_m": camera_height,
+                "baseline_m": baseline_m,
+                "baseline_between_s": baseline_between,
+            },
+            "map": {"voxel_size_m": voxel_size},
+        },
+    )
     from slamdepth.pipeline import RunOptions, run
 
     options = RunOptions(sequence, output, camera, max_frames, stride, not no_mesh, overwrite)
@@ -78,23 +115,16 @@ def run_command(
     _print_result(result, quiet)
 
 
-def _settings(
-    path: Path | None,
-    depth: str | None,
-    odometry: str | None,
-    voxel_size: float | None,
-    device: str | None,
-    seed: int | None,
-) -> Config:
-    """Command line over YAML file over defaults."""
+def _settings(path: Path | None, asked: dict[str, Any]) -> Config:
+    """Command line over YAML file over defaults; what is None was not asked for."""
     from slamdepth.config import Config
 
-    overrides: dict[str, Any] = {"odometry": odometry, "device": device, "seed": seed}
-    overrides = {name: value for name, value in overrides.items() if value is not None}
-    if depth is not None:
-        overrides["depth"] = {"name": depth}
-    if voxel_size is not None:
-        overrides["map"] = {"voxel_size_m": voxel_size}
+    overrides: dict[str, Any] = {}
+    for name, value in asked.items():
+        if isinstance(value, dict):
+            value = {key: inner for key, inner in value.items() if inner is not None}
+        if value is not None and value != {}:
+            overrides[name] = value
     if path is None:
         return Config.from_dict(overrides, origin="command line")
     return Config.from_yaml(path, overrides)

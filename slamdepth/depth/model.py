@@ -107,7 +107,9 @@ class Dinov2Depth:
 
 @register("dinov2")
 def create(*, device: str = "cpu", seed: int = 0, weights: Path | None = None) -> Dinov2Depth:
-    """The model with the cached backbone and the head file ``weights`` (default: the shipped
-    head); it has nothing random."""
+    """The model with the cached backbone and the head in ``weights``, by default the shipped one.
+
+    It has nothing random.
+    """
     del seed
     return Dinov2Depth.load(head=weights, device=device)

@@ -19,6 +19,7 @@ FILES = {
     "trajectory.txt": "every placed frame after optimisation (TUM format, camera to world)",
     "trajectory_online.txt": "each frame's pose as it was first placed, written while the run went on",
     "keyframes.txt": "the keyframes of trajectory.txt",
+    "depth_scale.yaml": "the scale fitted to the sequence's own sensor (--depth-scale groundtruth)",
     "mesh.ply": "coloured mesh of the scene in the frame of the first camera, metres",
     "report.html": "figures and plots of the run; opens in any browser, needs nothing else",
     "report.json": "the same figures for programs",

@@ -10,6 +10,8 @@ from slamdepth.report.text import MISSING, count, fixed, percent
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from slamdepth.depth.scale import ScaleFit
+
     Rows = list[tuple[str, str]]
 
 
@@ -27,7 +29,7 @@ def run_table(summary: dict[str, Any], places: dict[str, str] | None = None) -> 
         ("keyframes", count(summary["keyframes"])),
         ("loop closures", count(summary["loop_closures"])),
         ("relocalisations", count(summary["relocalisations"])),
-        ("scale", summary["scale"]),
+        ("scale", summary["scale"]["sentence"]),
     ]
     if summary["skipped_frames"]:
         rows.insert(1, ("images skipped", count(summary["skipped_frames"])))
@@ -64,6 +66,23 @@ def depth_table(figures: dict[str, Any], title: str = "depth against the sensor"
         rmse = fixed(errors["rmse_m"], 3, "m")
         table.add_row(label, fixed(errors["abs_rel"], 3), rmse, fixed(errors["delta1"], 3))
     return table
+
+
+def scale_table(fit: ScaleFit) -> Table:
+    """A scale fitted to a sensor, with how sure it is."""
+    unit = fit.scale.domain.shift_unit
+    has_shift = fit.shift_sigma is not None or fit.scale.shift != 0.0
+    sure = "one frame: unknown" if fit.scale_sigma_log is None else f"± {percent(fit.scale_sigma_log)}"
+    rows = [
+        (f"scale of {fit.scale.domain.value}", f"{fit.scale.scale:.4g}{'' if has_shift else f' {sure}'}"),
+        ("frames", f"{count(fit.frames)}, {count(fit.pixels)} pixels"),
+        ("spread over frames", f"{fit.frame_spread_log:.3f} (std of the log of each frame's own factor)"),
+    ]
+    if has_shift:
+        shift_sigma = MISSING if fit.shift_sigma is None else f"± {fit.shift_sigma:.3g} {unit}"
+        rows.insert(1, ("shift", f"{fit.scale.shift:.4g} {shift_sigma}"))
+        rows.insert(2, ("depth by both", f"{sure} at the middle depth"))
+    return _two_columns(f"{fit.model} on {fit.sequence}", rows)
 
 
 def _score_rows(figures: dict[str, Any], digits: int) -> Rows:

@@ -301,7 +301,7 @@ class Tracker:
         self._finished = True
         self._timings = {}
         with one_blas_thread(), self._timed("final"):
-            notes = optimise_everything(self._map, self._mapper, self._log, self.config)
+            notes, votes = optimise_everything(self._map, self._mapper, self._log, self.config)
         mean = {stage: float(np.mean(values)) for stage, values in self._totals.items()}
         return build_reconstruction(
             self._map,
@@ -313,6 +313,7 @@ class Tracker:
             rescues=self._rescues,
             timings_ms=mean,
             notes=notes,
+            scale_votes=votes,
         )
 
     @contextmanager
