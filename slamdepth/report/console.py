@@ -82,7 +82,7 @@ def scale_table(fit: ScaleFit) -> Table:
         shift_sigma = MISSING if fit.shift_sigma is None else f"± {fit.shift_sigma:.3g} {unit}"
         rows.insert(1, ("shift", f"{fit.scale.shift:.4g} {shift_sigma}"))
         rows.insert(2, ("depth by both", f"{sure} at the middle depth"))
-    return _two_columns(f"{fit.model} on {fit.sequence}", rows)
+    return two_columns(f"{fit.model} on {fit.sequence}", rows)
 
 
 def _score_rows(figures: dict[str, Any], digits: int) -> Rows:
