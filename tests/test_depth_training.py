@@ -18,9 +18,9 @@ from slamdepth.depth.training import loop
 from slamdepth.depth.training.augment import augmented_view, plain_view, turned_view
 from slamdepth.depth.training.config import AugmentConfig, TrainConfig
 from slamdepth.depth.training.data import data_folder, open_place
-from slamdepth.depth.training.features import plan_samples
 from slamdepth.depth.training.losses import laplace_nll, multiscale_gradient, scale_invariant
 from slamdepth.depth.training.stages import coarse_target
+from slamdepth.depth.training.views import plan_samples
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.types import Camera, Frame
 

@@ -61,6 +61,41 @@ def plain_view(frame: Frame, rows: int, columns: int) -> View:
     return View(*turned_view(frame, rows, columns, 0.0, 0.0, 0.0, 1.0, False))
 
 
+def mixed_view(first: View, second: View) -> View:
+    """Both scenes in one: of each pixel what is nearer, at the focal length of ``first``.
+
+    Two pairs are put into one canonical camera, so that sizes and depths stay true, and
+    occlude one another as solid scenes would. What a network can learn by heart of a place
+    (this counter, so that wall) is broken up; what a surface itself tells of its depth stays.
+    Where a sensor saw nothing the depth of the nearest pixel decides, and the result is unknown.
+    """
+    factor = np.float32(first.focal_px / second.focal_px)
+    second_m = second.depth_m * factor
+    in_front = _completed(first.depth_m) <= _completed(second_m)
+    return View(
+        np.where(in_front[..., None], first.image_rgb, second.image_rgb),
+        np.where(in_front, first.depth_m, second_m),
+        first.focal_px,
+    )
+
+
+def _completed(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``(H, W)`` with each unknown pixel given the depth of the nearest known one."""
+    import cv2
+
+    unknown = depth_m <= 0
+    if unknown.all():
+        return np.full_like(depth_m, np.inf)
+    if not unknown.any():
+        return depth_m
+    _, label = cv2.distanceTransformWithLabels(
+        unknown.astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(label.max()) + 1, np.float32)
+    of_label[label[~unknown]] = depth_m[~unknown]
+    return of_label[label]
+
+
 def turned_view(
     frame: Frame,
     rows: int,

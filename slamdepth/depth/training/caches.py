@@ -9,20 +9,15 @@ from pathlib import Path
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2
-from slamdepth.depth.training.config import TrainConfig, digest
+from slamdepth.depth.training.config import TrainConfig, ViewConfig, digest
 from slamdepth.depth.training.data import Place, PlaceReader, data_folder, open_place
-from slamdepth.depth.training.features import (
-    FeatureCache,
-    SampleKey,
-    build_cache,
-    plan_plain,
-    plan_samples,
-)
+from slamdepth.depth.training.features import FeatureCache, build_cache
 from slamdepth.depth.training.progress import Progress, silent
+from slamdepth.depth.training.views import SampleKey, plan_plain, plan_samples
 from slamdepth.errors import ConfigError
 
 _JUDGED_VIEWS = 50
-_VIEW_VERSION = 2
+_VIEW_VERSION = 3
 """Counts up where the same settings make other views or features."""
 
 
@@ -33,12 +28,14 @@ class PlannedCache:
     Attributes:
         folder: where it is kept; its name hashes all that decides on its content.
         keys: its samples, in order.
+        view: how they are made.
         held_out: name of the place where it is for judging, else None.
     """
 
     folder: Path
     places: tuple[Place, ...]
     keys: tuple[SampleKey, ...]
+    view: ViewConfig
     held_out: str | None = None
 
 
@@ -64,11 +61,9 @@ def plan_caches(
     if not trained:
         raise ConfigError("setting 'sources': there is no place to train on")
 
-    def where(places: tuple[Place, ...], *more: object) -> Path:
+    def where(view: ViewConfig, places: tuple[Place, ...], *more: object) -> Path:
         made_of = [place.fingerprint for place in places]
-        name = digest(
-            config.view, _VIEW_VERSION, config.head.taps, config.seed, backbone_sha256, made_of, *more
-        )
+        name = digest(view, _VIEW_VERSION, config.head.taps, config.seed, backbone_sha256, made_of, *more)
         return store.cache_dir() / "features" / name
 
     planned = []
@@ -77,12 +72,18 @@ def plan_caches(
             continue
         places = tuple(open_place(folder / place.name, source.reader, readers) for place in source.places)
         keys = plan_samples(places, [place.samples for place in source.places], config.seed)[: source.limit]
-        planned.append(PlannedCache(where(places, source.places, source.limit), places, tuple(keys)))
+        view = config.view
+        if source.augment is not None:
+            view = view.model_copy(update={"augment": source.augment})
+        folder_of = where(view, places, source.places, source.limit)
+        planned.append(PlannedCache(folder_of, places, tuple(keys), view))
     for folder, source in both:
         for name in source.held_out:
             place = open_place(folder / name, source.reader, readers)
             keys = plan_plain(0, place, _JUDGED_VIEWS)
-            planned.append(PlannedCache(where((place,), "plain"), (place,), tuple(keys), name))
+            planned.append(
+                PlannedCache(where(config.view, (place,), "plain"), (place,), tuple(keys), config.view, name)
+            )
     return planned
 
 
@@ -97,7 +98,7 @@ def fill_cache(
 ) -> FeatureCache:
     """Compute what is missing of ``planned``; errors of :func:`build_cache`."""
     return build_cache(
-        planned.folder, planned.places, planned.keys, config.view, backbone, config.head.taps, config.seed,
+        planned.folder, planned.places, planned.keys, planned.view, backbone, config.head.taps, config.seed,
         device=device, progress=progress, stage=stage,
     )  # fmt: skip
 

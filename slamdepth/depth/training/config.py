@@ -31,6 +31,10 @@ class AugmentConfig(_Section):
     blur: float = Field(0.3, ge=0, le=1, description="share of blurred images")
     noise: float = Field(0.3, ge=0, le=1, description="share of images with sensor noise")
     jpeg: float = Field(0.5, ge=0, le=1, description="share of images compressed again")
+    mixed: float = Field(
+        0.0, ge=0, le=1, description="share of views into which another is put, the nearer surface in front"
+    )
+    mixed_again: float = Field(0.35, ge=0, le=1, description="share of those into which a third is put")
 
 
 class PlaceConfig(_Section):
@@ -48,6 +52,7 @@ class SourceConfig(_Section):
         None, description="layout: pairs, hypersim, synth, tum, 7scenes; found out from the files if absent"
     )
     places: tuple[PlaceConfig, ...] = Field((), description="trained on")
+    augment: AugmentConfig | None = Field(None, description="of this source's views; view.augment if absent")
     held_out: tuple[str, ...] = Field((), description="places judged on after training, never trained on")
     limit: int | None = Field(
         None, ge=1, description="only so many of the samples, a random choice; leaves the others' views alone"

@@ -8,7 +8,6 @@ cache. It grows by a few samples at a time and continues where a killed run stop
 from __future__ import annotations
 
 import logging
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, normalised
-from slamdepth.depth.training.augment import View, augmented_view, plain_view
 from slamdepth.depth.training.config import ViewConfig
 from slamdepth.depth.training.data import Place
 from slamdepth.depth.training.progress import Progress, TrainStep, silent
 from slamdepth.depth.training.store import SampleStore, Spec, locked
+from slamdepth.depth.training.views import SampleKey, canonical_depth, make_view
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,15 +29,6 @@ if TYPE_CHECKING:
     from slamdepth.depth.dinov2 import DinoV2
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class SampleKey:
-    """Which view of which pair a sample is; copy -1 is the plain, unaugmented view."""
-
-    place: int
-    frame: int
-    copy: int
 
 
 @dataclass(frozen=True)
@@ -64,31 +54,6 @@ class FeatureCache:
 
     def __len__(self) -> int:
         return len(self.place)
-
-
-def plan_samples(places: Sequence[Place], samples: Sequence[int], seed: int) -> list[SampleKey]:
-    """Which views to make: each place's number spread over its frames, in random order.
-
-    A place with more frames than samples is thinned evenly; one with fewer is shown
-    several times, each copy augmented anew.
-    """
-    keys = []
-    for index, (place, count) in enumerate(zip(places, samples, strict=True)):
-        frames = len(place)
-        if count < frames:
-            chosen = np.linspace(0, frames - 1, count).round().astype(int)
-            keys += [SampleKey(index, int(frame), 0) for frame in chosen]
-        else:
-            keys += [SampleKey(index, k % frames, k // frames) for k in range(count)]
-    order = np.random.default_rng(seed).permutation(len(keys))
-    return [keys[k] for k in order]
-
-
-def plan_plain(place_index: int, place: Place, limit: int) -> list[SampleKey]:
-    """At most ``limit`` unaugmented views of one place, spread over it; for judging."""
-    count = min(limit, len(place))
-    chosen = np.linspace(0, len(place) - 1, count).round().astype(int)
-    return [SampleKey(place_index, int(frame), -1) for frame in chosen]
 
 
 def sample_specs(config: ViewConfig, taps: tuple[int, ...], dim: int, patch: int) -> dict[str, Spec]:
@@ -131,14 +96,13 @@ def build_cache(
         for count, group in enumerate(groups, start=1):
             views = [make_view(places, keys[k], config, seed) for k in group]
             tokens, class_tokens = encode([view.image_rgb for view in views], backbone, taps, device)
-            factors = [view.focal_px / CANONICAL_FOCAL_PX for view in views]
             store.put(
                 group,
                 tokens=tokens,
                 class_tokens=class_tokens,
                 image_rgb=np.stack([view.image_rgb for view in views]),
-                canonical_m=np.stack([_canonical(v, f, config) for v, f in zip(views, factors, strict=True)]),
-                focal_factor=factors,
+                canonical_m=np.stack([canonical_depth(view, config) for view in views]),
+                focal_factor=[view.focal_px / CANONICAL_FOCAL_PX for view in views],
             )
             progress(TrainStep(stage, count, len(groups)))
         store.commit()
@@ -148,21 +112,6 @@ def build_cache(
         arrays["tokens"], arrays["class_tokens"], arrays["image_rgb"], arrays["canonical_m"],
         np.asarray(arrays["focal_factor"]), place,
     )  # fmt: skip
-
-
-def _canonical(view: View, factor: float, config: ViewConfig) -> NDArray[np.float32]:
-    known = (view.depth_m >= config.min_depth_m) & (view.depth_m <= config.max_depth_m)
-    return np.where(known, view.depth_m / np.float32(factor), 0.0).astype(np.float32)
-
-
-def make_view(places: Sequence[Place], key: SampleKey, config: ViewConfig, seed: int) -> View:
-    """The view ``key`` names; the same for the same seed whatever else is made."""
-    place = places[key.place]
-    frame = place.read(key.frame)
-    if key.copy < 0:
-        return plain_view(frame, config.rows, config.columns)
-    rng = np.random.default_rng([seed, zlib.crc32(place.name.encode()), key.frame, key.copy])
-    return augmented_view(frame, config.rows, config.columns, config.augment, rng)
 
 
 def encode(
