@@ -15,7 +15,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from slamdepth.cli import evaluate, run, synth, train, weights
+from slamdepth.cli import eval_depth, evaluate, run, synth, train, weights
 from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_verbose
 from slamdepth.errors import SlamdepthError
 
@@ -34,7 +34,7 @@ app = typer.Typer(
 app.command("run")(run.run_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)
-app.command("eval-depth")(train.eval_depth_command)
+app.command("eval-depth")(eval_depth.eval_depth_command)
 app.command("train-depth")(train.train_depth_command)
 app.add_typer(weights.app, name="weights")
 

@@ -106,7 +106,8 @@ class Dinov2Depth:
 
 
 @register("dinov2")
-def create(*, device: str = "cpu", seed: int = 0) -> Dinov2Depth:
-    """The model with the cached backbone and the shipped head; it has nothing random."""
+def create(*, device: str = "cpu", seed: int = 0, weights: Path | None = None) -> Dinov2Depth:
+    """The model with the cached backbone and the head ``weights``, else the shipped one; it has
+    nothing random."""
     del seed
-    return Dinov2Depth.load(device=device)
+    return Dinov2Depth.load(head=weights, device=device)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from slamdepth.report.console import depth_table, run_table, trajectory_table
+from slamdepth.report.console import run_table, trajectory_table
 from slamdepth.report.data import MeshCounts, ReportData
 from slamdepth.report.html import build_html
 from slamdepth.report.summary import build_summary
@@ -14,7 +14,6 @@ __all__ = [
     "ReportData",
     "build_html",
     "build_summary",
-    "depth_table",
     "run_table",
     "trajectory_table",
     "write_report",
