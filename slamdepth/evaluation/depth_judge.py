@@ -14,7 +14,7 @@ import numpy as np
 from slamdepth.evaluation.bootstrap import Interval, interval, spread
 from slamdepth.evaluation.depth import depth_errors
 from slamdepth.evaluation.depth_fit import affine_fit, apply_affine, as_depth, fits_in
-from slamdepth.evaluation.depth_maps import depth_ssim, edge_score
+from slamdepth.evaluation.depth_maps import EdgeScore, depth_ssim, edge_score
 from slamdepth.types import DepthKind, DepthPrediction
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ FIGURES = (
 )  # fmt: skip
 BINS = 24
 _IN_MEMORY_BYTES = 2**28
+_NO_EDGES = EdgeScore(math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -176,8 +177,12 @@ class DepthJudge:
         for score in self._scores:
             depth, sensor = (np.load(self._waiting).astype(np.float64) for _ in range(2))
             row = dict(score)
+            edges: EdgeScore | None = None
             for way, scaled in self._scaled(depth, sensor, factor, score["log_factor"]):
-                row.update({f"{way}.{name}": value for name, value in self._figures(scaled, sensor).items()})
+                if edges is None or way == "frame_affine":  # a factor alone moves no edge
+                    edges = edge_score(scaled, sensor, (scaled > 0) & (sensor > 0)) or _NO_EDGES
+                figures = self._figures(scaled, sensor, edges)
+                row.update({f"{way}.{name}": value for name, value in figures.items()})
                 bins.add(way, scaled[self._grid], sensor[self._grid])
             rows.append(row)
         columns = {name: np.array([row.get(name, math.nan) for row in rows]) for name in _names(rows)}
@@ -209,16 +214,15 @@ class DepthJudge:
         ]
         return [("as_predicted", depth), *scaled] if self.kind is DepthKind.METRIC else scaled
 
-    def _figures(self, depth_m: Floats, sensor_m: Floats) -> dict[str, float]:
+    def _figures(self, depth_m: Floats, sensor_m: Floats, edges: EdgeScore) -> dict[str, float]:
         known = (depth_m > 0) & (sensor_m > 0)
         chosen = known[self._grid]
         errors = depth_errors(depth_m[self._grid][chosen], sensor_m[self._grid][chosen])
-        edges = edge_score(depth_m, sensor_m, known)
         return {
             **asdict(errors),
             "ssim": depth_ssim(depth_m, sensor_m, known),
-            "edge_f1": math.nan if edges is None else edges.f1,
-            "edge_error_px": math.nan if edges is None else edges.error_px,
+            "edge_f1": edges.f1,
+            "edge_error_px": edges.error_px,
         }
 
 
