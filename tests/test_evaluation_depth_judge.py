@@ -137,6 +137,13 @@ def test_sigma_by_hand() -> None:
     assert judgement.surest_half.value == pytest.approx(low / ((low + high) / 2), rel=1e-4)
 
 
+def test_many_frames_wait_on_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("slamdepth.evaluation.depth_judge._IN_MEMORY_BYTES", 1000)
+    judgement = judged([r * 0.8 for r in ROOMS], ROOMS)
+    is_perfect(judgement, "sequence_median")
+    assert judgement.ways["as_predicted"]["abs_rel"].value == pytest.approx(0.2, rel=1e-5)
+
+
 def test_errors_over_depth() -> None:
     near, far = np.full((8, 8), 1.0, np.float32), np.full((8, 8), 4.0, np.float32)
     judgement = judged([near * 1.1, far * 0.8], [near, far])

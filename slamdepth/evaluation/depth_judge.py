@@ -69,7 +69,8 @@ class DepthJudgement:
         over_depth: errors by depth.
         frames: number compared. pixels: of the errors, after subsampling.
         coverage: share of the sensor's pixels that have a prediction.
-        per_frame: figure, as ``way.figure`` or by its name above, to its ``frames`` values.
+        per_frame: figure, as ``way.figure``, ``log_factor`` (of ``frame_median``) or by its name
+            above, to its ``frames`` values.
     """
 
     kind: DepthKind
