@@ -12,6 +12,7 @@ file says how busy it was, and CPU time beside wall time shows whether others to
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -19,6 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+
+# Read when PyTorch loads; as the command line has it, so that times are those a user gets.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from benchmarks.depth_latency_stages import stage_row
 from benchmarks.depth_latency_variants import VARIANTS, variant_row
