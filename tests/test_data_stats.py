@@ -102,7 +102,7 @@ def test_broken_images_are_notes_unless_all_are(tmp_path: Path) -> None:
     folder = place(tmp_path / "p", [500, 600])
     (folder / "00000.png").write_bytes(b"")
     (one,) = data_statistics([folder])["sets"]
-    assert one["notes"] == ["1 images do not decode and are left out"]
+    assert one["notes"] == ["1 images cannot be read and are left out"]
     (folder / "00001.png").write_bytes(b"")
     with pytest.raises(DatasetError, match=r"p: no depth image could be read: .*00000\.png"):
         data_statistics([folder], output=tmp_path / "out")
@@ -113,7 +113,7 @@ def test_bad_input_and_interruption(tmp_path: Path) -> None:
     folder = place(tmp_path / "p", [500, 600])
     tum = make_tum(tmp_path / "tum")
     (tum / "depth.txt").unlink()
-    with pytest.raises(DatasetError, match="has no depth images"):
+    with pytest.raises(DatasetError, match="has no sensor depth"):
         data_statistics([folder, tum])
     with pytest.raises(ConfigError, match="stride"):
         data_statistics([folder], stride=0)

@@ -32,7 +32,6 @@ from slamdepth.report import (
     ScaleSource,
     build_html,
     build_summary,
-    depth_table,
     run_table,
     trajectory_table,
     write_report,
@@ -381,7 +380,6 @@ def test_console_tables() -> None:
         assert part in text
     assert "not scored" in rendered(run_table(build_summary(bare_data())))
     assert f"{score.sim3.rmse_m:.6f} m" in rendered(trajectory_table(score.to_dict()))
-    assert "as predicted" in rendered(depth_table(summary["depth"]))
 
 
 def test_figures_are_written_honestly() -> None:

@@ -18,7 +18,7 @@ def data_stats_command(
         list[Path],
         typer.Argument(
             metavar="DATA...",
-            help="Folders: training pairs (camera.json), a folder of such folders, TUM, 7-Scenes, synth.",
+            help="Sequences with sensor depth, training pairs, Hypersim scenes, or folders of those.",
         ),
     ],
     output: Annotated[

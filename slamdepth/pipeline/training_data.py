@@ -34,6 +34,24 @@ class SequencePlace:
     frames: tuple[int, ...]
     benchmark: str | None
 
+    @classmethod
+    def of(cls, dataset: Dataset, benchmark: str | None = None) -> SequencePlace:
+        """The frames of ``dataset`` whose image and depth are there; files are not opened.
+
+        Raises:
+            DatasetError: there are none.
+        """
+        if isinstance(dataset, ImageSequence):
+            paths = zip(dataset.image_paths, dataset.depth_paths, strict=True)
+            frames = tuple(
+                k for k, (image, depth) in enumerate(paths) if depth is not None and is_file(image)
+            )
+        else:
+            frames = tuple(range(len(dataset))) if dataset.has_depth else ()
+        if not frames:
+            raise DatasetError(f"{dataset.path}: has no sensor depth")
+        return cls(dataset, frames, benchmark)
+
     def __len__(self) -> int:
         return len(self.frames)
 
@@ -87,17 +105,7 @@ class SequenceReader:
         return self.reader.matches(folder)
 
     def open(self, folder: Path) -> SequencePlace:
-        dataset = self.reader.open(folder, None)
-        if isinstance(dataset, ImageSequence):
-            paths = zip(dataset.image_paths, dataset.depth_paths, strict=True)
-            frames = tuple(
-                k for k, (image, depth) in enumerate(paths) if depth is not None and is_file(image)
-            )
-        else:
-            frames = tuple(range(len(dataset))) if dataset.has_depth else ()
-        if not frames:
-            raise DatasetError(f"{folder}: has no sensor depth to train on")
-        return SequencePlace(dataset, frames, _BENCHMARKS.get(self.name))
+        return SequencePlace.of(self.reader.open(folder, None), _BENCHMARKS.get(self.name))
 
 
 @dataclass(frozen=True)

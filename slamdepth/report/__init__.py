@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from slamdepth.report.console import depth_table, run_table, scale_table, trajectory_table
+from slamdepth.report.console import run_table, scale_table, trajectory_table
 from slamdepth.report.data import MeshCounts, ReportData
 from slamdepth.report.html import build_html
 from slamdepth.report.scale import ScaleFacts, ScalePart, ScaleSource
@@ -18,7 +18,6 @@ __all__ = [
     "ScaleSource",
     "build_html",
     "build_summary",
-    "depth_table",
     "run_table",
     "scale_table",
     "trajectory_table",

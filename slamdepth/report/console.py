@@ -50,24 +50,6 @@ def trajectory_table(figures: dict[str, Any], title: str = "trajectory", digits:
     return two_columns(title, _score_rows(figures, digits))
 
 
-def depth_table(figures: dict[str, Any], title: str = "depth against the sensor") -> Table:
-    """The figures of ``DepthScore.to_dict()``, judged three ways."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=Text(title, style="bold"), title_justify="left", box=box.SIMPLE)
-    table.add_column("scaled")
-    for name in ("AbsRel", "RMSE", "δ < 1.25"):
-        table.add_column(name, justify="right")
-    ways = (("metric", "as predicted"), ("sequence_median", "once"), ("frame_median", "each frame"))
-    for key, label in ways:
-        errors = figures[key]
-        rmse = fixed(errors["rmse_m"], 3, "m")
-        table.add_row(label, fixed(errors["abs_rel"], 3), rmse, fixed(errors["delta1"], 3))
-    return table
-
-
 def scale_table(fit: ScaleFit) -> Table:
     """A scale fitted to a sensor, with how sure it is."""
     unit = fit.scale.domain.shift_unit

@@ -121,7 +121,7 @@ def open_place(
     if reader is not None and reader not in readers:
         raise DatasetError(f"unknown reader '{reader}' of training data; choose from: {', '.join(readers)}")
     if not folder.is_dir():
-        raise DatasetError(f"{folder}: no such folder of training data")
+        raise DatasetError(f"{folder}: no such folder")
     try:
         found = reader or next((name for name in readers if readers[name].matches(folder)), None)
         if found is None:
@@ -148,7 +148,7 @@ def data_folder(named: str) -> Path:
     if not path.is_absolute() and root and not path.is_dir():
         path = Path(root) / path
     if not path.is_dir():
-        raise DatasetError(f"{path}: no such folder of training data (is SLAMDEPTH_DATA set?)")
+        raise DatasetError(f"{path}: no such folder (is SLAMDEPTH_DATA set?)")
     return path
 
 
