@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,14 +69,14 @@ def test_it_learns_depth_that_one_feature_tells_and_repeats_itself() -> None:
     features = rng.uniform(0, 1, (64, 8)).astype(np.float16)
     depth = np.zeros((64, 224, 224), np.float32)
     depth[:] = (1.0 + 2.0 * features[:, :1, None]).astype(np.float32)
-    settings = MlpSettings(epochs=120, batch=16, hidden=32, learning_rate=5e-3)
+    settings = MlpSettings(epochs=40, batch=16, hidden=32, learning_rate=2e-2)
     head, losses = train_mlp(features, depth, settings)
     assert losses[-1] < 0.05 * losses[0]
     with torch.inference_mode():
         predicted = head(torch.from_numpy(features).float())[:, 16, 16].numpy()
     assert np.abs(predicted - depth[:, 0, 0]).mean() < 0.2
     assert np.corrcoef(predicted, depth[:, 0, 0])[0, 1] > 0.95
-    assert train_mlp(features, depth, settings)[1] == losses
+    assert train_mlp(features, depth, replace(settings, epochs=5))[1] == losses[:5]
 
 
 def test_depth_is_brought_to_one_focal_length() -> None:
