@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console
+from slamdepth.cli.options import StrideOption
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
 
@@ -25,7 +26,7 @@ def data_stats_command(
         Path | None,
         typer.Option("--output", "-o", metavar="DIR", help="Also write a page, a picture and JSON here."),
     ] = None,
-    stride: Annotated[int, typer.Option(min=1, metavar="N", help="Look at every Nth image.")] = 1,
+    stride: StrideOption = 1,
     max_frames: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Look at no more than N images of each.")
     ] = None,

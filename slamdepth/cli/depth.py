@@ -9,6 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console
+from slamdepth.cli.options import (
+    CameraOption,
+    DepthOption,
+    DepthWeightsOption,
+    DeviceOption,
+    MaxFramesOption,
+    StrideOption,
+)
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
 
@@ -28,18 +36,11 @@ def depth_command(
         Path | None,
         typer.Option("--output", "-o", metavar="DIR", help="Folder for the results. Default: depth/<name>"),
     ] = None,
-    depth: Annotated[
-        str, typer.Option(metavar="NAME", help="Depth model; an unknown name lists those there are.")
-    ] = "dinov2",
-    depth_weights: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Weights of the model, where not the usual ones.")
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="camera.yaml with the intrinsics in pixels. Without: see below."),
-    ] = None,
-    max_frames: Annotated[int | None, typer.Option(min=1, metavar="N", help="Stop after N images.")] = None,
-    stride: Annotated[int, typer.Option(min=1, metavar="N", help="Take every Nth image.")] = 1,
+    depth: DepthOption = "dinov2",
+    depth_weights: DepthWeightsOption = None,
+    camera: CameraOption = None,
+    max_frames: MaxFramesOption = None,
+    stride: StrideOption = 1,
     colour_range: Annotated[
         tuple[float, float] | None,
         typer.Option("--range", metavar="NEAR FAR", help="Ends of the colours in metres. Default: found"),
@@ -47,7 +48,7 @@ def depth_command(
     no_cloud: Annotated[
         bool, typer.Option("--no-cloud", help="Write no point clouds, the largest files.")
     ] = False,
-    device: Annotated[str, typer.Option(metavar="cpu|cuda", help="Where the network runs.")] = "cpu",
+    device: DeviceOption = "cpu",
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace earlier depth maps in the output folder.")
     ] = False,

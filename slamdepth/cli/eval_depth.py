@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
+from slamdepth.cli.options import CameraOption, DepthWeightsOption, DeviceOption
 
 if TYPE_CHECKING:
     from slamdepth.depth.base import DepthModel
@@ -29,12 +30,8 @@ def eval_depth_command(
             help="Sequences with sensor depth, training pairs, Hypersim scenes, or folders of those.",
         ),
     ],
-    depth_weights: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Weights of the model; for dinov2, of its head.")
-    ] = None,
-    camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="camera.yaml with the intrinsics in pixels.")
-    ] = None,
+    depth_weights: DepthWeightsOption = None,
+    camera: CameraOption = None,
     stride: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Judge every Nth frame. Default: 10, of training pairs 1"),
@@ -42,7 +39,7 @@ def eval_depth_command(
     max_frames: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Judge no more than N frames of each DATA.")
     ] = None,
-    device: Annotated[str, typer.Option(metavar="cpu|cuda", help="Where the network runs.")] = "cpu",
+    device: DeviceOption = "cpu",
     output: Annotated[
         Path | None,
         typer.Option(

@@ -20,13 +20,14 @@ class JobBar:
             TextColumn("{task.description:<10}"),
             BarColumn(bar_width=24),
             MofNCompleteColumn(),
+            TextColumn("{task.fields[state]}", markup=False),
             TimeRemainingColumn(compact=True),
             console=self._console,
             disable=quiet or not self._console.is_terminal,
             transient=True,
         )
         self._lines = not quiet and not self._console.is_terminal
-        self._task = self._bar.add_task("opening", total=None)
+        self._task = self._bar.add_task("opening", total=None, state="")
         self._doing = ""
         self._next_line = 0
 
@@ -38,12 +39,15 @@ class JobBar:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def show(self, doing: str, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` are done; another ``doing`` starts the bar anew."""
-        if doing != self._doing:
+    def show(self, doing: str, done: int, total: int, state: str = "") -> None:
+        """Show that ``done`` of ``total`` (0: unknown) are done, and ``state`` beside it; another
+        ``doing`` starts the bar anew."""
+        is_new = doing != self._doing
+        if is_new:
             self._doing, self._next_line = doing, 0
-            self._bar.reset(self._task, total=total or None, description=doing)
-        self._bar.update(self._task, completed=done, total=total or None)
-        if self._lines and done >= self._next_line:
+            self._bar.reset(self._task, total=total or None, description=doing, state=state)
+        self._bar.update(self._task, completed=done, total=total or None, state=state)
+        if self._lines and (is_new or (total and done >= self._next_line)):
             self._next_line = done + max(1, total // 10)
-            self._console.print(f"{doing} {done}/{total}", markup=False)
+            count = f" {done}/{total}" if total else ""
+            self._console.print(f"{doing}{count} {state}".rstrip(), markup=False)

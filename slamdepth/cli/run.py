@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
+from slamdepth.cli.console import QuietOption, VerboseOption, console
+from slamdepth.cli.options import CameraOption, DepthWeightsOption, MaxFramesOption, StrideOption
+from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
@@ -35,9 +37,7 @@ def run_command(
         str | None,
         typer.Option(metavar="dinov2|sensor", help="Where depth comes from. Default: dinov2"),
     ] = None,
-    depth_weights: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Weights file of the depth model.")
-    ] = None,
+    depth_weights: DepthWeightsOption = None,
     depth_scale: Annotated[
         str | None,
         typer.Option(
@@ -61,14 +61,12 @@ def run_command(
         str | None,
         typer.Option(metavar="orb|kiss-icp", help="What estimates the motion. Default: orb"),
     ] = None,
-    camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="camera.yaml with the intrinsics in pixels.")
-    ] = None,
+    camera: CameraOption = None,
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="YAML file with settings; options here win.")
     ] = None,
-    max_frames: Annotated[int | None, typer.Option(min=1, metavar="N", help="Stop after N frames.")] = None,
-    stride: Annotated[int, typer.Option(min=1, metavar="N", help="Take every Nth frame.")] = 1,
+    max_frames: MaxFramesOption = None,
+    stride: StrideOption = 1,
     no_mesh: Annotated[bool, typer.Option("--no-mesh", help="Make no mesh.")] = False,
     voxel_size: Annotated[
         float | None, typer.Option(metavar="M", help="Edge of the mesh's voxels in metres. Default: 0.02")
@@ -110,8 +108,8 @@ def run_command(
     from slamdepth.pipeline import RunOptions, run
 
     options = RunOptions(sequence, output, camera, max_frames, stride, not no_mesh, overwrite)
-    with stop_on_signals() as stop, _ProgressBar(quiet) as bar:
-        result = run(options, settings, progress=bar.show, stop=stop)
+    with stop_on_signals() as stop, JobBar(quiet) as bar:
+        result = run(options, settings, progress=lambda step: _show(bar, step), stop=stop)
     _print_result(result, quiet)
 
 
@@ -130,54 +128,14 @@ def _settings(path: Path | None, asked: dict[str, Any]) -> Config:
     return Config.from_yaml(path, overrides)
 
 
-class _ProgressBar:
-    """Frames, rate, state, keyframes, loops; on a pipe a line now and then instead."""
-
-    def __init__(self, quiet: bool) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self._console = error_console()
-        self._bar = Progress(
-            TextColumn("{task.description:<10}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[state]}"),
-            TimeRemainingColumn(compact=True),
-            console=self._console,
-            disable=quiet or not self._console.is_terminal,
-            transient=True,
+def _show(bar: JobBar, progress: RunProgress) -> None:
+    state = ""
+    if progress.status is not None:
+        state = (
+            f"{progress.fps:.1f} fps · {progress.status.value} · "
+            f"keyframes {progress.keyframes} · loops {progress.loop_closures}"
         )
-        self._lines = not quiet and not self._console.is_terminal
-        self._task = self._bar.add_task("opening", total=None, state="")
-        self._stage = ""
-        self._next_line = 0
-
-    def __enter__(self) -> _ProgressBar:
-        show_log(target=self._console)
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def show(self, progress: RunProgress) -> None:
-        """Show one state of the run."""
-        state = ""
-        if progress.status is not None:
-            state = (
-                f"{progress.fps:.1f} fps · {progress.status.value} · "
-                f"keyframes {progress.keyframes} · loops {progress.loop_closures}"
-            )
-        stage = progress.stage.value
-        is_new = stage != self._stage
-        self._stage = stage
-        if is_new:
-            self._bar.reset(self._task, total=progress.total or None, description=stage, state=state)
-        self._bar.update(self._task, completed=progress.done, total=progress.total or None, state=state)
-        if self._lines and (is_new or (state and progress.done >= self._next_line)):
-            self._next_line = progress.done + max(1, progress.total // 10)
-            count = f" {progress.done}/{progress.total}" if progress.total else ""
-            self._console.print(f"{stage}{count} {state}".rstrip(), markup=False)
+    bar.show(progress.stage.value, progress.done, progress.total, state)
 
 
 def _print_result(result: RunResult, quiet: bool) -> None:

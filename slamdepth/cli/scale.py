@@ -9,16 +9,22 @@ from typing import Annotated
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
+from slamdepth.cli.options import (
+    CameraOption,
+    DepthOption,
+    DepthWeightsOption,
+    DeviceOption,
+    MaxFramesOption,
+    StrideOption,
+)
 
 
 def scale_command(
     sequence: Annotated[
         Path, typer.Argument(metavar="SEQ", help="Folder of a sequence that has sensor depth.")
     ],
-    depth: Annotated[str, typer.Option(metavar="NAME", help="Depth model whose scale is fitted.")] = "dinov2",
-    depth_weights: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Weights file of the depth model.")
-    ] = None,
+    depth: DepthOption = "dinov2",
+    depth_weights: DepthWeightsOption = None,
     shift: Annotated[
         bool,
         typer.Option(
@@ -26,14 +32,10 @@ def scale_command(
             help="Fit a shift too: in metres of depth; in 1/m for models that predict inverse depth.",
         ),
     ] = False,
-    camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="camera.yaml with the intrinsics in pixels.")
-    ] = None,
-    stride: Annotated[int, typer.Option(min=1, metavar="N", help="Take every Nth frame.")] = 10,
-    max_frames: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Take no more than N frames.")
-    ] = None,
-    device: Annotated[str, typer.Option(metavar="cpu|cuda", help="Where the network runs.")] = "cpu",
+    camera: CameraOption = None,
+    stride: StrideOption = 10,
+    max_frames: MaxFramesOption = None,
+    device: DeviceOption = "cpu",
     output: Annotated[
         Path | None,
         typer.Option(

@@ -9,11 +9,12 @@ from typing import Annotated
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, show_log
+from slamdepth.cli.options import DeviceOption
 
 
 def train_depth_command(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file that describes the training.")],
-    device: Annotated[str, typer.Option(metavar="cpu|cuda", help="Where to train.")] = "cpu",
+    device: DeviceOption = "cpu",
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Tell samples, disk space and time, and train nothing.")
     ] = False,

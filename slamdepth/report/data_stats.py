@@ -14,8 +14,9 @@ import numpy as np
 
 from slamdepth.evaluation.depth_statistics import DepthStatistics
 from slamdepth.io import replacing, write_text
+from slamdepth.report.figure import new_figure, to_png
 from slamdepth.report.markup import section, table
-from slamdepth.report.pictures import NEAR_TO_FAR
+from slamdepth.report.pictures import near_to_far
 from slamdepth.report.text import MISSING, count, fixed, percent
 from slamdepth.types import Camera
 
@@ -104,12 +105,7 @@ def write_data_page(folder: Path, rows: list[DataRow], about: dict[str, Any]) ->
 
 def histogram_picture(rows: list[DataRow]) -> bytes:
     """A PNG: a histogram of depth for each data set over one axis, and its sparsity beside it."""
-    import io
-
     import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import LinearSegmentedColormap
-    from matplotlib.figure import Figure
 
     style = {
         "font.family": ["DejaVu Sans"], "font.size": 9.0,
@@ -119,10 +115,9 @@ def histogram_picture(rows: list[DataRow]) -> bytes:
     }  # fmt: skip
     edges_m = np.unique(np.round(np.geomspace(*_axis_ends_m(rows), _BINS + 1), 3))
     with matplotlib.rc_context(style):
-        figure = Figure(figsize=(9.6, 0.75 + 1.05 * len(rows)), layout="constrained", facecolor="white")
-        FigureCanvasAgg(figure)
-        axes = figure.subplots(len(rows), 2, squeeze=False, sharex="col", width_ratios=(5, 1.15))
-        colours = LinearSegmentedColormap.from_list("depth", NEAR_TO_FAR)
+        height = 0.75 + 1.05 * len(rows)
+        figure, axes = new_figure(9.6, height, len(rows), 2, sharex="col", width_ratios=(5, 1.15))
+        colours = near_to_far()
         for (left, right), row in zip(axes, rows, strict=True):
             _histogram(left, row, edges_m, colours)
             _sparsity(right, row)
@@ -133,9 +128,7 @@ def histogram_picture(rows: list[DataRow]) -> bytes:
         )
         axes[-1, 1].set_xlabel("pixels without depth (%)")
         axes[0, 1].set_xlim(0, 100)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
-    return buffer.getvalue()
+        return to_png(figure, dpi=150)
 
 
 def _axis_ends_m(rows: list[DataRow]) -> tuple[float, float]:

@@ -7,13 +7,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slamdepth.evaluation import DepthJudgement, Interval
-from slamdepth.io import replacing
-from slamdepth.report.pictures import NEAR_TO_FAR, UNKNOWN
+from slamdepth.report.figure import new_figure, write_png
+from slamdepth.report.pictures import UNKNOWN, near_to_far
 from slamdepth.report.text import MISSING, percent
 
 if TYPE_CHECKING:
@@ -104,14 +104,10 @@ def write_sheet(path: Path, rows: Sequence[SheetRow], scaled: str, title: str) -
     Raises:
         OutputError: the file cannot be written.
     """
-    from matplotlib.colors import LinearSegmentedColormap
-    from matplotlib.figure import Figure
-
-    depths = LinearSegmentedColormap.from_list("near to far", NEAR_TO_FAR).with_extremes(bad=UNKNOWN)
+    depths = near_to_far()
     known = np.concatenate([row.sensor_m[row.sensor_m > 0][::16] for row in rows])
     near, far = np.percentile(known, (1, 98))
-    figure = Figure(figsize=(13, 2.05 * len(rows) + 0.7), layout="constrained")
-    axes = figure.subplots(len(rows), 4, squeeze=False)
+    figure, axes = new_figure(13, 2.05 * len(rows) + 0.7, len(rows), 4)
     for line, row in zip(axes, rows, strict=True):
         both = (row.sensor_m > 0) & (row.predicted_m > 0)
         error = np.where(both, row.predicted_m / np.where(both, row.sensor_m, 1.0) - 1.0, np.nan)
@@ -133,7 +129,7 @@ def write_sheet(path: Path, rows: Sequence[SheetRow], scaled: str, title: str) -
     figure.colorbar(metres, ax=axes[:, 1:3].ravel().tolist(), label="depth, m", shrink=0.8)
     figure.colorbar(share, ax=axes[:, 3].tolist(), label="error, %", shrink=0.8)
     figure.suptitle(title, fontsize=10)
-    _save(figure, path)
+    write_png(figure, path)
 
 
 def write_over_depth(path: Path, judgements: Mapping[str, DepthJudgement], title: str) -> None:
@@ -142,11 +138,10 @@ def write_over_depth(path: Path, judgements: Mapping[str, DepthJudgement], title
     Raises:
         OutputError: the file cannot be written.
     """
-    from matplotlib.figure import Figure
     from matplotlib.ticker import StrMethodFormatter
 
-    figure = Figure(figsize=(8, 8), layout="constrained")
-    errors, bias, shares = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1))
+    figure, axes = new_figure(8, 8, 3, 1, sharex=True, height_ratios=(3, 2, 1))
+    errors, bias, shares = axes[:, 0]
     styles = {"as_predicted": "-", "frame_median": "--", "frame_affine": ":"}
     for colour, (name, judgement) in enumerate(judgements.items()):
         over = judgement.over_depth
@@ -170,13 +165,8 @@ def write_over_depth(path: Path, judgements: Mapping[str, DepthJudgement], title
         scale.set_minor_formatter(StrMethodFormatter("{x:g}"))
     shares.tick_params(axis="x", which="minor", labelsize="x-small")
     bias.tick_params(axis="y", which="minor", labelsize="x-small")
-    _save(figure, path)
+    write_png(figure, path)
 
 
 def _floats(values: Sequence[float | None]) -> NDArray[np.float64]:
     return np.array([math.nan if value is None else value for value in values])
-
-
-def _save(figure: Any, path: Path) -> None:
-    with replacing(path) as partial:
-        figure.savefig(partial, format="png", dpi=110)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -66,6 +66,13 @@ def colour_depth(
     coloured = np.stack(channels, axis=1).astype(np.uint8)[np.round(position * 255).astype(np.int64)]
     coloured[~known] = rgb_of(UNKNOWN)
     return coloured
+
+
+def near_to_far() -> Any:
+    """The colours of :func:`colour_depth` as a matplotlib colour map."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("near to far", NEAR_TO_FAR).with_extremes(bad=UNKNOWN)
 
 
 def keyframe_gallery(keyframes: tuple[Keyframe, ...], count: int = 4) -> Gallery | None:

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.errors import OutputError
-from slamdepth.io import replacing, write_json, write_text
+from slamdepth.io import write_json, write_text
 from slamdepth.report.environment import hardware, versions
-from slamdepth.report.pictures import NEAR_TO_FAR, UNKNOWN, colour_depth
+from slamdepth.report.figure import new_figure, write_png
+from slamdepth.report.pictures import colour_depth, near_to_far
 
 if TYPE_CHECKING:
     from slamdepth.depth.training.results import SampleView, TrainResult
 
-_DPI = 120
 _COLOURS = ("#17458f", "#c8502b", "#2f9e4f", "#8a4fb0", "#b58a00", "#11787f")
 _README = """What a training of a depth head left here.
 
@@ -72,7 +72,7 @@ def draw_losses(path: Path, result: TrainResult) -> None:
     """Loss, and where there are held-out places their AbsRel, over epochs, a colour a member."""
     history = result.history
     is_judged = any(figures.held_out_loss is not None for figures in history)
-    figure, axes = _new_figure(9.0, 6.4 if is_judged else 3.8, 2 if is_judged else 1, 1, sharex=True)
+    figure, axes = new_figure(9.0, 6.4 if is_judged else 3.8, 2 if is_judged else 1, 1, sharex=True)
     members = sorted({figures.member for figures in history})
     for member in members:
         own = [figures for figures in history if figures.member == member]
@@ -106,21 +106,20 @@ def draw_losses(path: Path, result: TrainResult) -> None:
         )
     axes[-1, 0].set(xlabel="epoch", xlim=(0.5, last + 0.5))
     axes[-1, 0].xaxis.get_major_locator().set_params(integer=True)
-    _save(figure, path)
+    write_png(figure, path)
 
 
 def draw_samples(path: Path, samples: tuple[SampleView, ...]) -> None:
     """A row a sample: image, sensor depth, prediction, deviation of its log."""
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LinearSegmentedColormap, Normalize
+    from matplotlib.colors import Normalize
 
     rows, columns = samples[0].image_rgb.shape[:2]
     width = 11.5
-    figure, axes = _new_figure(
+    figure, axes = new_figure(
         width, 0.4 + len(samples) * (0.195 * width * rows / columns + 0.2), len(samples), 4
     )
-    depth_colours = LinearSegmentedColormap.from_list("depth", NEAR_TO_FAR)
-    depth_colours.set_bad(UNKNOWN)
+    depth_colours = near_to_far()
     surest, most_unsure = np.percentile(np.concatenate([s.sigma_log.ravel() for s in samples]), (2, 98))
     for row, sample in zip(axes, samples, strict=True):
         known = sample.sensor_m[sample.sensor_m > 0]
@@ -141,19 +140,4 @@ def draw_samples(path: Path, samples: tuple[SampleView, ...]) -> None:
     titles = ("image", "sensor depth", "predicted depth", "deviation of log depth")
     for panel, title in zip(axes[0], titles, strict=True):
         panel.set_title(title, fontsize=10)
-    _save(figure, path)
-
-
-def _new_figure(width: float, height: float, rows: int, columns: int, **layout: Any) -> tuple[Any, Any]:
-    """A figure of ``width`` x ``height`` inches without pyplot's global state, and its axes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False, **layout)
-
-
-def _save(figure: Any, path: Path) -> None:
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=_DPI, metadata={"Software": None})
+    write_png(figure, path)
