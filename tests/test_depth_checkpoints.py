@@ -194,7 +194,7 @@ def test_relative_is_never_taken_for_metric(cache: Path, tmp_path: Path) -> None
         create_depth_model("depth-anything-v2-small-metric-outdoor", weights=metric_file)
 
     model = create_depth_model("depth-anything-v2-small", weights=relative_file)
-    with pytest.raises(ConfigError, match="predicts affine inverse depth; tracking needs a metric depth"):
+    with pytest.raises(ConfigError, match="predicts affine inverse depth; tracking needs metres"):
         check_model(model)
     with_depth = replace(frame_of(), depth_m=np.full((48, 64), 2.0, np.float32))
     assert "as_predicted" not in judge_depth(model, [with_depth]).ways
