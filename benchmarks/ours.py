@@ -21,7 +21,9 @@ class SlamDepth:
 
     def __init__(self, camera: Camera, config: Config) -> None:
         seed_everything(config.seed)
-        model = create_depth_model(config.depth.name, device=config.device, seed=config.seed)
+        model = create_depth_model(
+            config.depth.name, device=config.device, seed=config.seed, weights=config.depth.weights
+        )
         seed_torch(config.seed)
         self._tracker = create_tracker(camera, model, config)
 

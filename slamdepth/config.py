@@ -7,11 +7,13 @@ error that lists those that do.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from slamdepth.errors import ConfigError
 
@@ -73,11 +75,65 @@ class DepthConfig(_Section):
     """The depth prior of a keyframe."""
 
     name: str = Field("dinov2", description="depth model by its registered name")
+    weights: str | None = Field(
+        None, min_length=1, description="its weights file; null takes the shipped or cached one"
+    )
     min_m: float = Field(0.1, gt=0, description="nearer depth is dropped")
     max_m: float = Field(10.0, gt=0, description="farther depth is dropped")
     max_sigma_log: float = Field(
         1.0, gt=0, description="pixels whose log depth is less sure than this never become map points"
     )
+
+
+GROUND_TRUTH = "groundtruth"
+"""The word that takes the scale from what a sequence is judged by."""
+
+
+class ScaleConfig(_Section):
+    """What is known of the scale beside the depth model's own; see ``slamdepth.pipeline.scale``."""
+
+    depth: float | str | None = Field(
+        None,
+        description="factor on predicted depth: a number, a file of 'slamdepth scale', or 'groundtruth'",
+    )
+    camera_height_m: float | None = Field(
+        None, gt=0, le=100, description="height of the first camera over the floor in metres"
+    )
+    baseline_m: float | None = Field(
+        None, gt=0, le=1e5, description="distance in metres between the camera's places at two times"
+    )
+    baseline_between_s: tuple[float, float] | None = Field(
+        None, description="those two times, in seconds of the sequence; null: first and last placed frame"
+    )
+
+    @field_validator("depth", mode="before")
+    @classmethod
+    def _number_or_name(cls, value: Any) -> Any:
+        if isinstance(value, bool) or not isinstance(value, int | float | str | None):
+            raise ValueError("must be a number, a file or 'groundtruth'")
+        try:
+            number = value if value is None or isinstance(value, int | float) else float(value)
+        except ValueError:
+            if not str(value).strip():
+                raise ValueError("must be a number, a file or 'groundtruth'") from None
+            return value
+        if number is not None and not (math.isfinite(number) and number > 0):
+            raise ValueError("a factor must be a positive number")
+        return number
+
+    @model_validator(mode="after")
+    def _one_scale(self) -> ScaleConfig:
+        known = self.camera_height_m is not None or self.baseline_m is not None
+        if known and self.depth == GROUND_TRUTH:
+            raise ValueError(
+                "a scale from ground truth and a known size (camera height, baseline) exclude each other"
+            )
+        if self.baseline_between_s is not None:
+            if self.baseline_m is None:
+                raise ValueError("two times of a baseline need its length, baseline_m")
+            if not self.baseline_between_s[0] < self.baseline_between_s[1]:
+                raise ValueError("the first time of a baseline must come before the second")
+        return self
 
 
 class MapConfig(_Section):
@@ -101,6 +157,7 @@ class Config(_Section):
     bundle: BundleConfig = BundleConfig()
     loops: LoopConfig = LoopConfig()
     depth: DepthConfig = DepthConfig()
+    scale: ScaleConfig = ScaleConfig()
     map: MapConfig = MapConfig()
 
     @classmethod
@@ -136,8 +193,20 @@ class Config(_Section):
             raise ConfigError(f"{origin}: {_first_problem(error)}") from error
 
     def to_yaml(self) -> str:
-        """The settings as YAML that :meth:`from_yaml` reads back."""
-        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+        """The settings as YAML that :meth:`from_yaml` reads back, whatever folder it is read from."""
+        values = self._with_files(lambda name: str(Path(name).expanduser().absolute()))
+        return yaml.safe_dump(values, sort_keys=False)
+
+    def for_report(self) -> dict[str, Any]:
+        """The settings as nested plain values; of files only the names: a report is passed on."""
+        return self._with_files(lambda name: Path(name).name)
+
+    def _with_files(self, named: Callable[[str], str]) -> dict[str, Any]:
+        values = self.model_dump(mode="json")
+        for section, key in (("depth", "weights"), ("scale", "depth")):
+            if isinstance(value := values[section][key], str) and value != GROUND_TRUTH:
+                values[section][key] = named(value)
+        return values
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -162,4 +231,4 @@ def _first_problem(error: ValidationError) -> str:
             assert issubclass(annotation, BaseModel)
             section = annotation
         return f"unknown setting '{name}'; allowed here: {', '.join(sorted(section.model_fields))}"
-    return f"setting '{name}': {problem['msg']} (got {problem['input']!r})"
+    return f"setting '{name}': {problem['msg'].removeprefix('Value error, ')} (got {problem['input']!r})"

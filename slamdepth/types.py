@@ -267,6 +267,9 @@ class Reconstruction:
         points_m: ``(P, 3)`` float64 map points in the world frame, metres of the map.
         frames, tracked, loop_closures, relocalisations, rescues: counts over the run.
         timings_ms: mean milliseconds per call of each stage.
+        scale_votes: log ratio of the map's depths to the predicted ones, one for each
+            keyframe that could tell; the map's scale is where their median is 0. Empty
+            where nothing was voted on, as with a sensor.
     """
 
     trajectory: Trajectory
@@ -279,3 +282,4 @@ class Reconstruction:
     rescues: int
     timings_ms: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    scale_votes: tuple[float, ...] = ()

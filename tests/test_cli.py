@@ -12,7 +12,10 @@ from command_line import copy_of, images, replace_image, slamdepth
 
 from slamdepth.io import read_tum_trajectory
 
-COMMANDS = ("run", "synth", "evaluate", "train-depth", "eval-depth", "weights list", "weights pull")
+COMMANDS = (
+    "run", "scale", "synth", "evaluate", "depth", "data-stats", "train-depth", "eval-depth", "weights list",
+    "weights pull",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

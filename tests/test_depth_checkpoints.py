@@ -33,7 +33,7 @@ from slamdepth.depth.dinov2_heads import DptHead, LinearHead, OfficialHead
 from slamdepth.depth.dpt import BASE, LARGE, SMALL, DepthAnything, DptShape
 from slamdepth.depth.evaluate import judge_depth
 from slamdepth.depth.registry import create_depth_model, depth_model_names
-from slamdepth.errors import CameraError, ConfigError, DatasetError, TrackingError, WeightsError
+from slamdepth.errors import CameraError, ConfigError, TrackingError, WeightsError
 from slamdepth.tracker.checks import check_model
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
@@ -194,10 +194,10 @@ def test_relative_is_never_taken_for_metric(cache: Path, tmp_path: Path) -> None
         create_depth_model("depth-anything-v2-small-metric-outdoor", weights=metric_file)
 
     model = create_depth_model("depth-anything-v2-small", weights=relative_file)
-    with pytest.raises(ConfigError, match="predicts affine inverse depth; tracking needs a metric depth"):
+    with pytest.raises(ConfigError, match="predicts affine inverse depth; tracking needs metres"):
         check_model(model)
-    with pytest.raises(DatasetError, match="affine inverse depth"):
-        judge_depth(model, [frame_of()])
+    with_depth = replace(frame_of(), depth_m=np.full((48, 64), 2.0, np.float32))
+    assert "as_predicted" not in judge_depth(model, [with_depth]).ways
     disparity = DepthPrediction(np.ones((4, 4), np.float32), model.kind)
     with pytest.raises(TrackingError, match="cannot be read as metres"):
         log_depth_at(disparity, np.zeros((1, 2)))

@@ -119,15 +119,20 @@ class _Scaled:
 
 
 def test_judging_a_known_error() -> None:
-    judged = judge_depth(_Scaled(1.1, 0.2), [frame_of(), frame_of(depth=False)])
-    assert judged.accuracy.frames == 1
-    assert judged.accuracy.metric.abs_rel == pytest.approx(0.1, abs=1e-6)
-    assert judged.accuracy.frame_median.abs_rel == pytest.approx(0.0, abs=1e-6)
-    assert judged.uncertainty is not None
-    assert judged.uncertainty.within_one_sigma == 1.0
+    seen: list[int] = []
+    judged = judge_depth(
+        _Scaled(1.1, 0.2),
+        [frame_of(), frame_of(depth=False)],
+        watch=lambda frame, prediction: seen.append(frame.index),
+    )
+    assert judged.frames == len(seen) == 1
+    assert judged.ways["as_predicted"]["abs_rel"].value == pytest.approx(0.1, abs=1e-6)
+    assert judged.ways["frame_median"]["abs_rel"].value == pytest.approx(0.0, abs=1e-6)
+    assert judged.within_one_sigma is not None
+    assert judged.within_one_sigma.value == 1.0
     wrong = judge_depth(_Scaled(1.1, 0.05), [frame_of()])
-    assert wrong.uncertainty is not None
-    assert wrong.uncertainty.within_one_sigma == 0.0
+    assert wrong.within_one_sigma is not None
+    assert wrong.within_one_sigma.value == 0.0
 
 
 def test_judging_without_any_depth_is_an_error() -> None:
@@ -155,5 +160,18 @@ def test_shipped_model_on_a_real_image(data_dir: Path) -> None:
     frame = Frame(0, 0.0, image, Camera(640, 480, 585, 585, 320, 240), depth_m)
     judged = judge_depth(model, [frame])
     # zero-shot: the right order of magnitude and better than a constant
-    assert judged.accuracy.metric.abs_rel < 0.5
-    assert judged.accuracy.frame_median.delta1 > 0.35
+    assert judged.ways["as_predicted"]["abs_rel"].value < 0.5
+    assert judged.ways["frame_median"]["delta1"].value > 0.35
+
+
+def test_the_default_takes_a_head_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[Path | None] = []
+
+    def load(*, head: Path | None, device: str) -> Dinov2Depth:
+        asked.append(head)
+        return tiny_model()
+
+    monkeypatch.setattr(Dinov2Depth, "load", load)
+    create_depth_model("dinov2")
+    create_depth_model("dinov2", weights=tmp_path / "mine.safetensors")
+    assert asked == [None, tmp_path / "mine.safetensors"]

@@ -10,32 +10,19 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from killed_training import tiny_backbone
+from training_places import make_place
 
-from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.head import load_head
 from slamdepth.depth.training import loop
 from slamdepth.depth.training.augment import augmented_view, plain_view, turned_view
 from slamdepth.depth.training.config import AugmentConfig, TrainConfig
 from slamdepth.depth.training.data import data_folder, open_place
-from slamdepth.depth.training.features import plan_samples
 from slamdepth.depth.training.losses import laplace_nll, multiscale_gradient, scale_invariant
+from slamdepth.depth.training.stages import coarse_target
+from slamdepth.depth.training.views import plan_samples
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.types import Camera, Frame
-
-
-def make_place(folder: Path, count: int = 4, width: int = 64, height: int = 48) -> Path:
-    """Images whose brightness tells the depth."""
-    folder.mkdir(parents=True)
-    about = {"width": width, "height": height, "fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
-    (folder / "camera.json").write_text(json.dumps({**about, "depth_unit_m": 0.001}))
-    rng = np.random.default_rng(0)
-    for k in range(count):
-        grey = cv2.resize(rng.uniform(40, 220, (3, 4)), (width, height))
-        cv2.imwrite(str(folder / f"{k:05d}.jpg"), np.repeat(grey[:, :, None], 3, 2).astype(np.uint8))
-        depth = np.round(500 + 10 * grey).astype(np.uint16)
-        depth[:4] = 0
-        cv2.imwrite(str(folder / f"{k:05d}.png"), depth)
-    return folder
 
 
 @pytest.fixture
@@ -63,16 +50,8 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
     }
 
 
-def backbone() -> DinoV2:
-    torch.manual_seed(0)
-    model = DinoV2(dim=24, depth=2, heads=3, grid=5)
-    for parameter in model.parameters():
-        torch.nn.init.normal_(parameter, std=0.1)
-    return model.eval().requires_grad_(False)
-
-
 def train(settings: dict) -> loop.TrainResult:
-    return loop.train_depth(TrainConfig.from_dict(settings), backbone=backbone())
+    return loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone())
 
 
 def test_training_writes_a_loadable_head_and_judges_held_out_places(settings: dict) -> None:
@@ -120,7 +99,7 @@ def test_a_killed_training_goes_on_to_the_same_result(
 
 def test_features_are_computed_once(settings: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     train(settings)
-    model = backbone()
+    model = tiny_backbone()
     monkeypatch.setattr(model, "forward", lambda *a: pytest.fail("the features are cached"))
     loop.train_depth(TrainConfig.from_dict({**settings, "learning_rate": 1e-3}), backbone=model)
 
@@ -186,9 +165,9 @@ def test_reading_places(tmp_path: Path) -> None:
 def test_bad_places_are_named(tmp_path: Path) -> None:
     folder = make_place(tmp_path / "room")
     with pytest.raises(DatasetError, match=r"no camera\.json"):
-        open_place(tmp_path)
+        open_place(tmp_path, "pairs")
     (folder / "00001.png").write_bytes(b"x")
-    with pytest.raises(DatasetError, match=r"00001\.png: does not decode"):
+    with pytest.raises(DatasetError, match=r"00001\.png: the image does not decode"):
         open_place(folder).read(1)
     cv2.imwrite(str(folder / "00002.png"), np.ones((5, 5), np.uint16))
     with pytest.raises(DatasetError, match=r"00002\.png.*camera\.json says"):
@@ -196,7 +175,7 @@ def test_bad_places_are_named(tmp_path: Path) -> None:
     (folder / "camera.json").write_text('{"width": 64}')
     with pytest.raises(DatasetError, match=r"camera\.json: the key 'height' is missing"):
         open_place(folder)
-    with pytest.raises(DatasetError, match="no such folder of training pairs"):
+    with pytest.raises(DatasetError, match="no such folder"):
         data_folder(str(tmp_path / "absent"))
 
 
@@ -293,4 +272,4 @@ def test_coarse_target_is_the_median_of_what_is_known() -> None:
     target = torch.zeros(1, 14, 7)
     target[0, :2, :3] = 1.0
     target[0, 0, 5] = 9.0
-    torch.testing.assert_close(loop.coarse_target(target), torch.tensor([[[1.0], [0.0]]]))
+    torch.testing.assert_close(coarse_target(target), torch.tensor([[[1.0], [0.0]]]))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from made_up import MadeUpDataset, pose
 
-from slamdepth.pipeline.results import judge_depth, judge_trajectory, keyframe_trajectory, scale_sentence
-from slamdepth.types import DepthKind, DepthPrediction, Frame, Keyframe, Reconstruction, Trajectory
+from slamdepth.pipeline.results import judge_depth, judge_trajectory, keyframe_trajectory
+from slamdepth.types import DepthKind, DepthPrediction, Keyframe, Reconstruction, Trajectory
 
 
 def keyframe(number: int, scale: float, *, is_sensor: bool = False) -> Keyframe:
@@ -64,16 +64,3 @@ def test_keyframes_become_a_trajectory() -> None:
     assert not found.is_metric
     empty = keyframe_trajectory(Reconstruction(trajectory, (), np.zeros((0, 3)), 0, 0, 0, 0, 0))
     assert len(empty) == 0
-
-
-def test_the_scale_is_told_honestly() -> None:
-    class Model:
-        name, kind, weights = "net", DepthKind.METRIC, ()
-
-        def predict(self, frame: Frame) -> DepthPrediction:
-            raise NotImplementedError
-
-    assert "measured" in scale_sentence(Model(), (keyframe(0, 1.0, is_sensor=True),))
-    assert "predicted by net" in scale_sentence(Model(), (keyframe(0, 1.0),))
-    Model.kind = DepthKind.AFFINE_INVERSE_DEPTH
-    assert "unknown" in scale_sentence(Model(), (keyframe(0, 1.0),))

@@ -27,9 +27,11 @@ from slamdepth.geometry import se3_exp
 from slamdepth.report import (
     MeshCounts,
     ReportData,
+    ScaleFacts,
+    ScalePart,
+    ScaleSource,
     build_html,
     build_summary,
-    depth_table,
     run_table,
     trajectory_table,
     write_report,
@@ -52,6 +54,18 @@ from slamdepth.types import (
 
 COUNT = 80
 CAMERA = Camera(width=32, height=24, fx=30.0, fy=30.0, cx=15.5, cy=11.5)
+SCALE = ScaleFacts(
+    ScaleSource.CAMERA_HEIGHT,
+    1.2,
+    "Scale comes from the network.",
+    uncertainty_log=0.03,
+    keyframes=6,
+    spread=0.1,
+    parts=(
+        ScalePart(ScaleSource.NETWORK, 1.0, 0.2, 0.02),
+        ScalePart(ScaleSource.CAMERA_HEIGHT, 1.21, 0.03, 0.98),
+    ),
+)
 VOID_TAGS = {"meta", "img", "br", "hr", "link", "input"}
 
 
@@ -105,7 +119,7 @@ def full_data() -> ReportData:
         ),
         fps=12.5,
         config=Config(),
-        scale="Scale comes from the network.",
+        scale=SCALE,
         weights=(WeightsInfo("head & backbone", "ab" * 32, "some rooms", "Apache-2.0"),),
         steps=steps,
         trajectory_score=score_trajectory(truth, estimate),
@@ -122,7 +136,9 @@ def bare_data() -> ReportData:
     """A run that was stopped before its first frame."""
     nothing = Trajectory(np.empty(0), np.empty((0, 4, 4)))
     run = Reconstruction(nothing, (), np.empty((0, 3)), 0, 0, 0, 0, 0)
-    return ReportData("empty", "sensor", run, 0.0, Config(), "The sensor's.")
+    return ReportData(
+        "empty", "sensor", run, 0.0, Config(), ScaleFacts(ScaleSource.SENSOR, 1.0, "The sensor's.")
+    )
 
 
 class BalancedTags(HTMLParser):
@@ -160,6 +176,10 @@ def test_summary_has_the_promised_keys_and_values() -> None:
         assert summary["rpe"][span]["rot_rmse_deg"] > 0
     assert summary["depth"]["metric"]["abs_rel"] == pytest.approx(0.1, rel=1e-4)
     assert summary["depth"]["sequence_median"]["abs_rel"] == pytest.approx(0.0, abs=1e-5)
+    scale = summary["scale"]
+    assert (scale["source"], scale["factor"], scale["uncertainty_log"]) == ("camera-height", 1.2, 0.03)
+    assert (scale["keyframes"], scale["spread"], scale["sentence"]) == (6, 0.1, SCALE.sentence)
+    assert [part["source"] for part in scale["parts"]] == ["network", "camera-height"]
     assert summary["mesh"] == {"vertices": 1234, "triangles": 5678}
     assert summary["weights"][0] == {
         "name": "head & backbone",
@@ -360,7 +380,6 @@ def test_console_tables() -> None:
         assert part in text
     assert "not scored" in rendered(run_table(build_summary(bare_data())))
     assert f"{score.sim3.rmse_m:.6f} m" in rendered(trajectory_table(score.to_dict()))
-    assert "as predicted" in rendered(depth_table(summary["depth"]))
 
 
 def test_figures_are_written_honestly() -> None:
@@ -369,3 +388,24 @@ def test_figures_are_written_honestly() -> None:
     assert percent(None) == count(None) == fixed(None, 2, "m") == "–"
     assert count(1234567) == "1\u202f234\u202f567"
     assert fixed(1.23456, 2, "m") == "1.23 m"
+
+
+def test_a_scale_from_ground_truth_is_no_metric_claim() -> None:
+    given = replace(
+        SCALE, source=ScaleSource.GROUND_TRUTH_DEPTH, from_ground_truth=True, prediction_factor=1.2
+    )
+    for scale, is_claim in ((SCALE, True), (given, False)):
+        data = replace(full_data(), scale=scale)
+        page = build_html(data, build_summary(data))
+        assert ("RMSE, scale as estimated" in page) is is_claim
+        assert ("no metric claim" in page) is not is_claim
+        assert ("depth scale applied" in page) is not is_claim
+        assert scale.sentence in rendered(run_table(build_summary(data)))
+
+
+def test_a_report_names_files_without_their_folders() -> None:
+    config = Config.from_dict(
+        {"depth": {"weights": "/some/where/head.st"}, "scale": {"depth": "/a/b/s.yaml"}}
+    )
+    settings = build_summary(replace(full_data(), config=config))["settings"]
+    assert (settings["depth"]["weights"], settings["scale"]["depth"]) == ("head.st", "s.yaml")

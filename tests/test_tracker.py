@@ -53,8 +53,11 @@ def test_sensor_depth_tracks_every_frame_in_metres(sensor_run: tuple[Run, Recons
 def test_a_constant_prior_tracks_every_frame_up_to_scale(constant_run: tuple[Run, Reconstruction]) -> None:
     run, reconstruction = constant_run
     assert run.statuses() == {TrackingStatus.TRACKING: COUNT}
-    assert ate_m(reconstruction.trajectory, with_scale=True) < 0.03
-    assert any("scale" in note for note in reconstruction.notes)
+    assert ate_m(reconstruction.trajectory, with_scale=True) < 0.02
+    votes = reconstruction.scale_votes
+    assert 2 <= len(votes) <= len(reconstruction.keyframes)
+    assert abs(np.median(votes)) < 1e-9
+    assert np.std(votes) > 0.01
 
 
 def test_the_reconstruction_is_consistent(
@@ -127,7 +130,7 @@ def test_the_constant_prior_was_bent_to_the_scene(constant_run: tuple[Run, Recon
         before, after = np.log(k.prediction.values / truth), np.log(k.depth_m / truth)
         spread.append((before.std(), after.std()))
     before, after = np.mean(spread, axis=0)
-    assert after < 0.95 * before
+    assert after < 0.8 * before
 
 
 def test_the_same_input_gives_the_same_bits(sensor_run: tuple[Run, Reconstruction]) -> None:

@@ -15,7 +15,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from slamdepth.cli import evaluate, run, synth, train, weights
+from slamdepth.cli import data_stats, depth, eval_depth, evaluate, run, scale, synth, train, weights
 from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_verbose
 from slamdepth.errors import SlamdepthError
 
@@ -32,10 +32,13 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("run")(run.run_command)
+app.command("scale")(scale.scale_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)
-app.command("eval-depth")(train.eval_depth_command)
+app.command("depth")(depth.depth_command)
+app.command("eval-depth")(eval_depth.eval_depth_command)
 app.command("train-depth")(train.train_depth_command)
+app.command("data-stats")(data_stats.data_stats_command)
 app.add_typer(weights.app, name="weights")
 
 

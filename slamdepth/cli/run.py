@@ -3,20 +3,17 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
+from slamdepth.cli.console import QuietOption, VerboseOption, console
+from slamdepth.cli.options import CameraOption, DepthWeightsOption, MaxFramesOption, StrideOption
+from slamdepth.cli.progress import JobBar
+from slamdepth.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
-    from types import FrameType
-
     from slamdepth.config import Config
     from slamdepth.pipeline import RunProgress, RunResult
 
@@ -40,18 +37,36 @@ def run_command(
         str | None,
         typer.Option(metavar="dinov2|sensor", help="Where depth comes from. Default: dinov2"),
     ] = None,
+    depth_weights: DepthWeightsOption = None,
+    depth_scale: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|X|groundtruth",
+            help="Multiply predicted depth: by a file of 'slamdepth scale', by a number, or by what this "
+            "sequence's ground truth says.",
+        ),
+    ] = None,
+    camera_height: Annotated[
+        float | None, typer.Option(metavar="M", help="First camera's height over the floor in metres.")
+    ] = None,
+    baseline_m: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="Distance in metres from the first camera to the last; see next."),
+    ] = None,
+    baseline_between: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="T1 T2", help="Seconds of the sequence that --baseline-m is between."),
+    ] = None,
     odometry: Annotated[
         str | None,
         typer.Option(metavar="orb|kiss-icp", help="What estimates the motion. Default: orb"),
     ] = None,
-    camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="camera.yaml with the intrinsics in pixels.")
-    ] = None,
+    camera: CameraOption = None,
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="YAML file with settings; options here win.")
     ] = None,
-    max_frames: Annotated[int | None, typer.Option(min=1, metavar="N", help="Stop after N frames.")] = None,
-    stride: Annotated[int, typer.Option(min=1, metavar="N", help="Take every Nth frame.")] = 1,
+    max_frames: MaxFramesOption = None,
+    stride: StrideOption = 1,
     no_mesh: Annotated[bool, typer.Option("--no-mesh", help="Make no mesh.")] = False,
     voxel_size: Annotated[
         float | None, typer.Option(metavar="M", help="Edge of the mesh's voxels in metres. Default: 0.02")
@@ -74,103 +89,53 @@ def run_command(
 
     Ctrl-C finishes the run with the frames it has; a second Ctrl-C breaks it off.
     """
-    settings = _settings(config, depth, odometry, voxel_size, device, seed)
+    settings = _settings(
+        config,
+        {
+            "odometry": odometry,
+            "device": device,
+            "seed": seed,
+            "depth": {"name": depth, "weights": None if depth_weights is None else str(depth_weights)},
+            "scale": {
+                "depth": depth_scale,
+                "camera_height_m": camera_height,
+                "baseline_m": baseline_m,
+                "baseline_between_s": baseline_between,
+            },
+            "map": {"voxel_size_m": voxel_size},
+        },
+    )
     from slamdepth.pipeline import RunOptions, run
 
     options = RunOptions(sequence, output, camera, max_frames, stride, not no_mesh, overwrite)
-    with _stop_on_signals() as stop, _ProgressBar(quiet) as bar:
-        result = run(options, settings, progress=bar.show, stop=stop)
+    with stop_on_signals() as stop, JobBar(quiet) as bar:
+        result = run(options, settings, progress=lambda step: _show(bar, step), stop=stop)
     _print_result(result, quiet)
 
 
-def _settings(
-    path: Path | None,
-    depth: str | None,
-    odometry: str | None,
-    voxel_size: float | None,
-    device: str | None,
-    seed: int | None,
-) -> Config:
-    """Command line over YAML file over defaults."""
+def _settings(path: Path | None, asked: dict[str, Any]) -> Config:
+    """Command line over YAML file over defaults; what is None was not asked for."""
     from slamdepth.config import Config
 
-    overrides: dict[str, Any] = {"odometry": odometry, "device": device, "seed": seed}
-    overrides = {name: value for name, value in overrides.items() if value is not None}
-    if depth is not None:
-        overrides["depth"] = {"name": depth}
-    if voxel_size is not None:
-        overrides["map"] = {"voxel_size_m": voxel_size}
+    overrides: dict[str, Any] = {}
+    for name, value in asked.items():
+        if isinstance(value, dict):
+            value = {key: inner for key, inner in value.items() if inner is not None}
+        if value is not None and value != {}:
+            overrides[name] = value
     if path is None:
         return Config.from_dict(overrides, origin="command line")
     return Config.from_yaml(path, overrides)
 
 
-@contextmanager
-def _stop_on_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set; the second one raises KeyboardInterrupt."""
-    stop = threading.Event()
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-class _ProgressBar:
-    """Frames, rate, state, keyframes, loops; on a pipe a line now and then instead."""
-
-    def __init__(self, quiet: bool) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self._console = error_console()
-        self._bar = Progress(
-            TextColumn("{task.description:<10}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[state]}"),
-            TimeRemainingColumn(compact=True),
-            console=self._console,
-            disable=quiet or not self._console.is_terminal,
-            transient=True,
+def _show(bar: JobBar, progress: RunProgress) -> None:
+    state = ""
+    if progress.status is not None:
+        state = (
+            f"{progress.fps:.1f} fps · {progress.status.value} · "
+            f"keyframes {progress.keyframes} · loops {progress.loop_closures}"
         )
-        self._lines = not quiet and not self._console.is_terminal
-        self._task = self._bar.add_task("opening", total=None, state="")
-        self._stage = ""
-        self._next_line = 0
-
-    def __enter__(self) -> _ProgressBar:
-        show_log(target=self._console)
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def show(self, progress: RunProgress) -> None:
-        """Show one state of the run."""
-        state = ""
-        if progress.status is not None:
-            state = (
-                f"{progress.fps:.1f} fps · {progress.status.value} · "
-                f"keyframes {progress.keyframes} · loops {progress.loop_closures}"
-            )
-        stage = progress.stage.value
-        is_new = stage != self._stage
-        self._stage = stage
-        if is_new:
-            self._bar.reset(self._task, total=progress.total or None, description=stage, state=state)
-        self._bar.update(self._task, completed=progress.done, total=progress.total or None, state=state)
-        if self._lines and (is_new or (state and progress.done >= self._next_line)):
-            self._next_line = progress.done + max(1, progress.total // 10)
-            count = f" {progress.done}/{progress.total}" if progress.total else ""
-            self._console.print(f"{stage}{count} {state}".rstrip(), markup=False)
+    bar.show(progress.stage.value, progress.done, progress.total, state)
 
 
 def _print_result(result: RunResult, quiet: bool) -> None:

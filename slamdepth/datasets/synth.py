@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 SCENE_VERSION = 1
 """To be raised with every change that changes a pixel: a folder of another version is not continued."""
 
-_SETTINGS_FILE = "synth.yaml"
+SETTINGS_FILE = "synth.yaml"
+"""Lies in every rendered folder and says how it was rendered."""
+
 _TEXEL_AT_640_M = 0.0025
 
 
@@ -185,7 +187,7 @@ def _render_sequence(
 def _claim(output: Path, settings: SynthSettings) -> None:
     """Make ``output`` ours, or say whose it is."""
     record = {"scene_version": SCENE_VERSION, **settings.model_dump(mode="json")}
-    record_file = output / _SETTINGS_FILE
+    record_file = output / SETTINGS_FILE
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file; name a folder for the sequence")
     if record_file.is_file():
@@ -202,7 +204,7 @@ def _claim(output: Path, settings: SynthSettings) -> None:
             )
         return
     if output.is_dir() and any(output.iterdir()):
-        raise OutputError(f"{output}: is not empty and holds no {_SETTINGS_FILE}; name a new folder")
+        raise OutputError(f"{output}: is not empty and holds no {SETTINGS_FILE}; name a new folder")
     output.mkdir(parents=True, exist_ok=True)
     write_text(record_file, yaml.safe_dump(record, sort_keys=False))
 

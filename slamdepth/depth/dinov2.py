@@ -6,15 +6,15 @@ Parameter names are those of the official files, so both load without renaming.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from slamdepth.depth.checkpoints import read_checkpoint
 from slamdepth.depth.layout import check_layout, dinov2_layout
-from slamdepth.errors import WeightsError
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -173,7 +173,7 @@ def load_dinov2(path: Path, device: str = "cpu") -> DinoV2:
         WeightsError: the file cannot be read, or a tensor is missing, extra or
             misshapen; names it.
     """
-    tensors = read_tensors(path)
+    tensors = read_checkpoint(path)
     check_layout(
         {name: tuple(value.shape) for name, value in tensors.items()},
         dinov2_layout(),
@@ -184,23 +184,3 @@ def load_dinov2(path: Path, device: str = "cpu") -> DinoV2:
     model = DinoV2()
     model.load_state_dict({name: value.float() for name, value in tensors.items()})
     return model.eval().requires_grad_(False).to(device)
-
-
-def read_tensors(path: Path) -> dict[str, Tensor]:
-    """All tensors of a safetensors or a (weights-only) PyTorch file.
-
-    Raises:
-        WeightsError: the file cannot be read or holds something else.
-    """
-    try:
-        if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
-
-            return load_file(str(path))
-        loaded = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # pickle, zip and safetensors each raise their own types
-        first_line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise WeightsError(f"{path}: not a readable weights file: {first_line}") from error
-    if not isinstance(loaded, Mapping) or not all(isinstance(value, Tensor) for value in loaded.values()):
-        raise WeightsError(f"{path}: expected a flat table of tensors")
-    return dict(loaded)

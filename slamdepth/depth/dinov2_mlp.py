@@ -98,6 +98,12 @@ def token_features(backbone: DinoV2, images: Tensor) -> Tensor:
     return tokens.flatten(1)
 
 
+def at_size(depth_m: Tensor, height: int, width: int) -> NDArray[np.float32]:
+    """The first map of ``(B, S, S)`` enlarged to ``(height, width)``."""
+    full = F.interpolate(depth_m[:1, None], size=(height, width), mode="bilinear", align_corners=False)
+    return np.asarray(full[0, 0].cpu().numpy(), dtype=np.float32)
+
+
 class Dinov2Mlp(NetworkDepth):
     """A DINOv2 backbone and the fully connected head.
 
@@ -147,9 +153,8 @@ class Dinov2Mlp(NetworkDepth):
         height, width = image_rgb.shape[:2]
         image = normalised(resize_rgb(image_rgb, SIDE, SIDE)[None], self.device)
         with torch.inference_mode():
-            depth_m = self._head(token_features(self._backbone, image))[:, None]
-            depth_m = F.interpolate(depth_m, size=(height, width), mode="bilinear", align_corners=False)
-        return depth_m[0, 0].cpu().numpy(), (SIDE, SIDE)
+            depth_m = self._head(token_features(self._backbone, image))
+        return at_size(depth_m, height, width), (SIDE, SIDE)
 
 
 def model_card(about: Mapping[str, str]) -> ModelCard:
@@ -190,7 +195,7 @@ def load_mlp(
         WeightsError: the file cannot be read, is of another format, or a tensor is
             missing, extra or misshapen; names it.
     """
-    about = _header(path)
+    about = read_header(path)
     if about.get("format") != FORMAT:
         raise WeightsError(f"{path}: not a {NAME} head of this package (format {about.get('format')!r})")
     if "focal_px" in about and not _is_positive(about["focal_px"]):
@@ -203,7 +208,12 @@ def load_mlp(
     return head, about
 
 
-def _header(path: Path) -> dict[str, str]:
+def read_header(path: Path) -> dict[str, str]:
+    """What :func:`save_mlp` was told about a head.
+
+    Raises:
+        WeightsError: the file cannot be read.
+    """
     from safetensors import SafetensorError, safe_open
 
     try:

@@ -13,13 +13,10 @@ from torch.nn import functional as F
 from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2
 from slamdepth.depth.head import HeadEnsemble, load_head
-from slamdepth.depth.preprocess import focal_factor, input_size, normalised, resize_rgb
+from slamdepth.depth.preprocess import check_size, focal_factor, input_size, normalised, resize_rgb
 from slamdepth.depth.registry import register
-from slamdepth.errors import CameraError, ConfigError
+from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
-
-SMALLEST_SIDE = 28
-LARGEST_ASPECT = 6.0
 
 
 class Dinov2Depth:
@@ -81,12 +78,8 @@ class Dinov2Depth:
         Raises:
             CameraError: the image is too small or too narrow for the network.
         """
+        check_size(frame)
         height, width = frame.image_rgb.shape[:2]
-        if min(height, width) < SMALLEST_SIDE or max(height, width) > LARGEST_ASPECT * min(height, width):
-            raise CameraError(
-                f"frame {frame.index}: {width}x{height} pixels; the depth network needs sides of at least "
-                f"{SMALLEST_SIDE} pixels and an aspect of at most {LARGEST_ASPECT:g}:1"
-            )
         rows, columns = input_size(height, width)
         image = normalised(resize_rgb(frame.image_rgb, rows, columns)[None], self.device)
         with torch.inference_mode():
@@ -120,7 +113,10 @@ def working_type(device: str) -> torch.dtype:
 
 
 @register("dinov2")
-def create(*, device: str = "cpu", seed: int = 0) -> Dinov2Depth:
-    """The model with the cached backbone and the shipped head; it has nothing random."""
+def create(*, device: str = "cpu", seed: int = 0, weights: Path | None = None) -> Dinov2Depth:
+    """The model with the cached backbone and the head in ``weights``, by default the shipped one.
+
+    It has nothing random.
+    """
     del seed
-    return Dinov2Depth.load(device=device)
+    return Dinov2Depth.load(head=weights, device=device)

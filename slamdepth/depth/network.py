@@ -10,11 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slamdepth.depth.card import ModelCard
-from slamdepth.errors import CameraError
+from slamdepth.depth.preprocess import check_size
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
-
-SMALLEST_SIDE = 28
-LARGEST_ASPECT = 6.0
 
 
 class NetworkDepth(ABC):
@@ -52,12 +49,7 @@ class NetworkDepth(ABC):
         Raises:
             CameraError: the image is too small or too narrow for the network.
         """
-        height, width = frame.image_rgb.shape[:2]
-        if min(height, width) < SMALLEST_SIDE or max(height, width) > LARGEST_ASPECT * min(height, width):
-            raise CameraError(
-                f"frame {frame.index}: {width}x{height} pixels; the depth network needs sides of at least "
-                f"{SMALLEST_SIDE} pixels and an aspect of at most {LARGEST_ASPECT:g}:1"
-            )
+        check_size(frame)
         values, size = self.infer(frame.image_rgb)
         if self.kind is DepthKind.METRIC and self.card.native_focal_px is not None:
             values = values * np.float32(focal_ratio(frame.camera, size, self.card.native_focal_px))

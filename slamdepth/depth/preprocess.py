@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.types import Camera
+from slamdepth.errors import CameraError
+from slamdepth.types import Camera, Frame
 
 if TYPE_CHECKING:
     import torch
@@ -22,6 +23,19 @@ CANONICAL_FOCAL_PX = 280.0
 Depth seen through a lens twice as long looks half as far, so the network predicts
 ``z * CANONICAL_FOCAL_PX / f`` and :func:`focal_factor` undoes it.
 """
+
+SMALLEST_SIDE = 28
+LARGEST_ASPECT = 6.0
+
+
+def check_size(frame: Frame) -> None:
+    """Raise CameraError where the image of ``frame`` is too small or too narrow for a network."""
+    height, width = frame.image_rgb.shape[:2]
+    if min(height, width) < SMALLEST_SIDE or max(height, width) > LARGEST_ASPECT * min(height, width):
+        raise CameraError(
+            f"frame {frame.index}: {width}x{height} pixels; the depth network needs sides of at least "
+            f"{SMALLEST_SIDE} pixels and an aspect of at most {LARGEST_ASPECT:g}:1"
+        )
 
 
 def input_size(height: int, width: int, area: int = INPUT_AREA) -> tuple[int, int]:

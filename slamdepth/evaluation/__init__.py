@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from slamdepth.evaluation.bootstrap import Interval
 from slamdepth.evaluation.depth import DepthAccumulator, DepthErrors, DepthScore
+from slamdepth.evaluation.depth_judge import DepthJudge, DepthJudgement, mean_over_sets
 from slamdepth.evaluation.trajectory import (
     MAX_DIFFERENCE_S,
     AbsoluteError,
@@ -17,8 +19,12 @@ __all__ = [
     "AbsoluteError",
     "DepthAccumulator",
     "DepthErrors",
+    "DepthJudge",
+    "DepthJudgement",
     "DepthScore",
+    "Interval",
     "RelativeError",
     "TrajectoryScore",
+    "mean_over_sets",
     "score_trajectory",
 ]

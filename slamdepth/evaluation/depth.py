@@ -171,7 +171,7 @@ class DepthAccumulator:
             self._held = sum(len(p) for p, _ in self._samples)
 
 
-def depth_errors(predicted_m: Pixels, sensor_m: Pixels) -> DepthErrors:
+def depth_errors(predicted_m: NDArray[np.floating], sensor_m: NDArray[np.floating]) -> DepthErrors:
     """Errors over ``(N,)`` positive depths of the same pixels, in metres."""
     predicted = np.asarray(predicted_m, dtype=np.float64)
     sensor = np.asarray(sensor_m, dtype=np.float64)

@@ -1,9 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files in and out: TUM trajectories, images, text and JSON."""
+"""Files in and out: TUM trajectories, images, point clouds, text and JSON."""
 
 from __future__ import annotations
 
-from slamdepth.io.images import read_depth_m, read_depth_raw, read_image_rgb
+from slamdepth.io.images import (
+    read_depth_m,
+    read_depth_raw,
+    read_image_rgb,
+    write_depth_mm,
+    write_npy,
+    write_png,
+)
+from slamdepth.io.ply import encode_ply, write_point_cloud
 from slamdepth.io.text import parse_float, read_lines, replacing, write_json, write_text
 from slamdepth.io.trajectory import (
     TrajectoryWriter,
@@ -14,6 +22,7 @@ from slamdepth.io.trajectory import (
 
 __all__ = [
     "TrajectoryWriter",
+    "encode_ply",
     "format_timestamp",
     "parse_float",
     "read_depth_m",
@@ -22,7 +31,11 @@ __all__ = [
     "read_lines",
     "read_tum_trajectory",
     "replacing",
+    "write_depth_mm",
     "write_json",
+    "write_npy",
+    "write_png",
+    "write_point_cloud",
     "write_text",
     "write_tum_trajectory",
 ]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colour and depth images in; what does not decode whole is an error, never a grey patch."""
+"""Colour and depth images in and out; what does not decode whole is an error, never a grey patch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slamdepth.errors import ImageDecodeError
+from slamdepth.errors import ImageDecodeError, OutputError
+from slamdepth.io.text import replacing
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,18 +20,23 @@ _PNG_END = b"IEND\xaeB`\x82"
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9"
 
 
-def read_image_rgb(path: str | Path) -> NDArray[np.uint8]:
+MILLIMETRES_END_M = 65.535
+"""The farthest depth a 16-bit image in millimetres can hold."""
+
+
+def read_image_rgb(path: str | Path, *, upright: bool = False) -> NDArray[np.uint8]:
     """Read a colour image as ``(H, W, 3)`` uint8 RGB.
 
-    Grey images get three equal channels; a rotation noted in EXIF is not applied, since
-    intrinsics belong to the pixels as they were taken.
+    Grey images get three equal channels; a rotation noted in EXIF is applied only where
+    ``upright``, since intrinsics belong to the pixels as they were taken.
 
     Raises:
         ImageDecodeError: the file is missing, empty, cut short or no image.
     """
     import cv2
 
-    image = _decode(Path(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    as_taken = 0 if upright else cv2.IMREAD_IGNORE_ORIENTATION
+    image = _decode(Path(path), cv2.IMREAD_COLOR | as_taken)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
@@ -68,6 +74,49 @@ def read_depth_m(
     for value in unknown_raw:
         depth_m[raw == value] = 0.0
     return depth_m
+
+
+def write_png(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Write ``(H, W, 3)`` uint8 RGB or ``(H, W)`` uint8 or uint16 as PNG, whole or not at all.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+    """
+    import cv2
+
+    pixels = image[..., ::-1] if image.ndim == 3 else image
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
+    if not done:
+        raise OutputError(f"{path}: the image {image.shape} {image.dtype} cannot be encoded as PNG")
+    with replacing(path) as temporary:
+        temporary.write_bytes(data.tobytes())
+
+
+def write_depth_mm(path: str | Path, depth_m: NDArray[np.floating]) -> int:
+    """Write depth ``(H, W)`` in metres as a 16-bit PNG in whole millimetres, 0 where unknown.
+
+    Returns:
+        How many known pixels are 0 in the file because they lie beyond 65.535 m.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+    """
+    known = np.isfinite(depth_m) & (depth_m > 0)
+    millimetres = np.rint(np.where(known, depth_m, 0.0).astype(np.float64) * 1000.0)
+    beyond = millimetres > 1000.0 * MILLIMETRES_END_M
+    millimetres[beyond] = 0.0
+    write_png(path, millimetres.astype(np.uint16))
+    return int(beyond.sum())
+
+
+def write_npy(path: str | Path, array: NDArray[Any]) -> None:
+    """Write an array in NumPy's own format, whole or not at all.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+    """
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.save(file, array, allow_pickle=False)
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.errors import OutputError
-from slamdepth.io import replacing
+from slamdepth.io import encode_ply, replacing
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -87,21 +87,7 @@ def _bytes_of(colors: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _ply(mesh: TriangleMesh) -> bytes:
-    vertices = np.empty(len(mesh.vertices_m), [("position", "<f4", 3), ("color", "u1", 3)])
-    vertices["position"], vertices["color"] = mesh.vertices_m, _bytes_of(mesh.colors)
-    faces = np.empty(len(mesh.triangles), [("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, mesh.triangles
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *(f"property float {axis}" for axis in "xyz"),
-        *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
-    return ("\n".join(header) + "\n").encode("ascii") + vertices.tobytes() + faces.tobytes()
+    return encode_ply(mesh.vertices_m, _bytes_of(mesh.colors), mesh.triangles)
 
 
 def _obj(mesh: TriangleMesh) -> bytes:

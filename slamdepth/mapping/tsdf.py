@@ -97,7 +97,7 @@ def _consistent(keyframes: Sequence[Keyframe], settings: MapConfig) -> list[NDAr
     predicted = [k for k, keyframe in enumerate(keyframes) if not keyframe.prediction.is_sensor]
     views = [
         View.of(
-            _undistorted_depth(trusted_depth(keyframes[k], settings.max_depth_m), keyframes[k].frame.camera),
+            undistorted_depth(trusted_depth(keyframes[k], settings.max_depth_m), keyframes[k].frame.camera),
             keyframes[k].frame.camera,
             keyframes[k].T_world_camera,
         )
@@ -126,7 +126,7 @@ def _integrated(
     )  # fmt: skip
     for k, keyframe in enumerate(keyframes):
         camera = keyframe.frame.camera
-        depth = _undistorted_depth(trusted_depth(keyframe, settings.max_depth_m), camera)
+        depth = undistorted_depth(trusted_depth(keyframe, settings.max_depth_m), camera)
         mask = keep[k]
         if mask is not None:
             depth = np.where(_widened(mask, depth.shape), depth, np.float32(0.0))
@@ -152,7 +152,7 @@ def _integrated(
     return grid
 
 
-def _undistorted_depth(depth_m: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+def undistorted_depth(depth_m: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
     """Nearest known depth, never mixed: a mean of two surfaces lies on neither."""
     if not camera.is_distorted:
         return depth_m

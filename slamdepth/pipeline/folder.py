@@ -19,6 +19,7 @@ FILES = {
     "trajectory.txt": "every placed frame after optimisation (TUM format, camera to world)",
     "trajectory_online.txt": "each frame's pose as it was first placed, written while the run went on",
     "keyframes.txt": "the keyframes of trajectory.txt",
+    "depth_scale.yaml": "the scale fitted to the sequence's own sensor (--depth-scale groundtruth)",
     "mesh.ply": "coloured mesh of the scene in the frame of the first camera, metres",
     "report.html": "figures and plots of the run; opens in any browser, needs nothing else",
     "report.json": "the same figures for programs",
@@ -53,20 +54,20 @@ class RunFolder:
             while path.exists():
                 path = Path("runs") / f"{stem}-{number}"
                 number += 1
-            return cls(_writable(path))
+            return cls(writable(path))
         path = Path(output).expanduser()
         try:
             if path.exists() and not path.is_dir():
                 raise OutputError(f"{path}: is a file; name a folder for the results")
             if not (path.is_dir() and any(path.iterdir())):
-                return cls(_writable(path))
+                return cls(writable(path))
             if not _is_run(path):
                 raise OutputError(f"{path}: is not empty and holds no earlier run; name a new folder")
         except OSError as error:
             raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from error
         if not overwrite:
             raise OutputError(f"{path}: holds an earlier run; name another folder or add --overwrite")
-        return cls(_writable(path), replaces=True)
+        return cls(writable(path), replaces=True)
 
     def create(self) -> None:
         """Make the folder, empty of the files of an earlier run, and its README.
@@ -141,7 +142,7 @@ def _is_run(path: Path) -> bool:
         return False
 
 
-def _writable(path: Path) -> Path:
+def writable(path: Path) -> Path:
     """``path``, if it or the nearest folder above it that exists can be written."""
     place = path.absolute()
     while not place.exists() and place != place.parent:

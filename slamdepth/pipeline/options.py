@@ -50,6 +50,7 @@ class RunOptions:
 class Stage(str, Enum):
     """What a run is doing."""
 
+    SCALING = "fitting the scale"
     TRACKING = "tracking"
     OPTIMISING = "optimising"
     MESHING = "meshing"
@@ -61,7 +62,7 @@ class RunProgress:
     """State of a run, told after each frame and at each new stage.
 
     Attributes:
-        done, total: frames while tracking, keyframes while meshing.
+        done, total: frames while tracking and fitting, keyframes while meshing.
         fps: frames per second so far.
         status: of the last frame, None before the first.
     """

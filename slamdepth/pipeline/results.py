@@ -10,7 +10,6 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset
-from slamdepth.depth.base import DepthModel
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.evaluation import DepthAccumulator, DepthScore, TrajectoryScore, score_trajectory
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, Stage
@@ -69,7 +68,7 @@ def judge_trajectory(
 
 
 def judge_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore | None:
-    """Compare the keyframes' predicted depth, before any scaling, with the sensor's."""
+    """Compare the keyframes' predicted depth, as the tracker was given it, with the sensor's."""
     if not dataset.has_depth:
         return None
     judged = DepthAccumulator()
@@ -84,12 +83,3 @@ def judge_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore
         if sensor_m is not None:
             judged.add(keyframe.prediction.values, sensor_m)
     return judged.score()
-
-
-def scale_sentence(model: DepthModel, keyframes: tuple[Keyframe, ...]) -> str:
-    """Is the map metric, and how was its scale found."""
-    if any(keyframe.prediction.is_sensor for keyframe in keyframes):
-        return "metric, measured by the depth sensor"
-    if model.kind is DepthKind.METRIC:
-        return f"metric as far as the depth predicted by {model.name} is; no sensor measured it"
-    return f"unknown: {model.name} predicts depth up to scale, so lengths have no unit"

@@ -17,6 +17,7 @@ from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
+from slamdepth.depth.scale_file import write_scale
 from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.io import write_text, write_tum_trajectory
 from slamdepth.pipeline.folder import FILES, RunFolder, run_log, write_log_to
@@ -27,13 +28,18 @@ from slamdepth.pipeline.options import (
     RunResult,
     Stage,
 )
+from slamdepth.pipeline.prediction_scale import (
+    PredictionScale,
+    check_scale_options,
+    choose_prediction_scale,
+)
 from slamdepth.pipeline.results import (
     judge_depth,
     judge_trajectory,
     keyframe_trajectory,
-    scale_sentence,
     write_keyframe_mesh,
 )
+from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.tracking import Tracked, track
 from slamdepth.report import MeshCounts, ReportData, write_report
 
@@ -76,9 +82,21 @@ def run(
                 "--depth dinov2"
             )
         indices = options.indices(len(dataset))
+        check_scale_options(dataset, config, indices)
         folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite)
         seed_everything(config.seed)
-        model = create_depth_model(config.depth.name, device=config.device, seed=config.seed)
+        given = create_depth_model(
+            config.depth.name, device=config.device, seed=config.seed, weights=config.depth.weights
+        )
+        scale = choose_prediction_scale(
+            dataset,
+            given,
+            config,
+            indices,
+            progress=lambda done, total: tell(RunProgress(Stage.SCALING, done, total)),
+            stop=stopped,
+        )
+        model = scale.applied_to(given)
         seed_torch(config.seed)
         tracker = _make_tracker(dataset, model, config)
 
@@ -86,6 +104,8 @@ def run(
         try:
             write_log_to(log, folder / "log.txt")
             write_text(folder / "config.yaml", _settings_text(options, config))
+            if scale.fit is not None:
+                write_scale(folder / "depth_scale.yaml", scale.fit)
             logger.info(
                 "%s: %d of %d frames, depth by %s", dataset.path, len(indices), len(dataset), model.name
             )
@@ -105,7 +125,7 @@ def run(
         except BaseException:
             logger.debug("the run broke off", exc_info=True)
             raise
-        return _finish(dataset, model, tracked, folder, options, config, tell)
+        return _finish(dataset, model, scale, tracked, folder, options, config, tell)
 
 
 def _make_tracker(dataset: Dataset, model: DepthModel, config: Config) -> Any:
@@ -117,6 +137,7 @@ def _make_tracker(dataset: Dataset, model: DepthModel, config: Config) -> Any:
 def _finish(
     dataset: Dataset,
     model: DepthModel,
+    scale: PredictionScale,
     tracked: Tracked,
     folder: RunFolder,
     options: RunOptions,
@@ -124,10 +145,10 @@ def _finish(
     tell: ProgressCallback,
 ) -> RunResult:
     """Everything after tracking; the trajectory first, since it is what was asked for."""
-    reconstruction = tracked.reconstruction
+    reconstruction, scale_facts, scale_notes = settle_scale(dataset, tracked.reconstruction, scale, config)
     write_tum_trajectory(folder / "trajectory.txt", reconstruction.trajectory)
     write_tum_trajectory(folder / "keyframes.txt", keyframe_trajectory(reconstruction))
-    notes = [*dataset.notes, *tracked.notes]
+    notes = [*dataset.notes, *tracked.notes, *scale_notes]
 
     mesh: MeshCounts | None = None
     if options.mesh:
@@ -140,6 +161,9 @@ def _finish(
             logger.warning("%s", note)
         notes += mesh_notes
 
+    absent = {
+        name for name, is_there in (("mesh.ply", mesh), ("depth_scale.yaml", scale.fit)) if not is_there
+    }
     tell(RunProgress(Stage.SCORING))
     trajectory_score, score_notes = judge_trajectory(dataset, reconstruction.trajectory)
     notes += score_notes
@@ -151,7 +175,7 @@ def _finish(
             reconstruction=reconstruction,
             fps=tracked.fps,
             config=config,
-            scale=scale_sentence(model, reconstruction.keyframes),
+            scale=scale_facts,
             weights=model.weights,
             steps=tracked.steps,
             trajectory_score=trajectory_score,
@@ -160,7 +184,7 @@ def _finish(
             skipped_frames=tracked.skipped,
             notes=tuple(notes),
             options=_reported_options(options, tracked),
-            files={name: what for name, what in FILES.items() if mesh or name != "mesh.ply"},
+            files={name: what for name, what in FILES.items() if name not in absent},
         ),
     )
     logger.info("done: %s", folder.path)

@@ -3,19 +3,23 @@
 
 from __future__ import annotations
 
-from slamdepth.report.console import depth_table, run_table, trajectory_table
+from slamdepth.report.console import run_table, scale_table, trajectory_table
 from slamdepth.report.data import MeshCounts, ReportData
 from slamdepth.report.html import build_html
+from slamdepth.report.scale import ScaleFacts, ScalePart, ScaleSource
 from slamdepth.report.summary import build_summary
 from slamdepth.report.write import write_report
 
 __all__ = [
     "MeshCounts",
     "ReportData",
+    "ScaleFacts",
+    "ScalePart",
+    "ScaleSource",
     "build_html",
     "build_summary",
-    "depth_table",
     "run_table",
+    "scale_table",
     "trajectory_table",
     "write_report",
 ]

@@ -10,6 +10,8 @@ from slamdepth.report.text import MISSING, count, fixed, percent
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from slamdepth.depth.scale import ScaleFit
+
     Rows = list[tuple[str, str]]
 
 
@@ -27,7 +29,7 @@ def run_table(summary: dict[str, Any], places: dict[str, str] | None = None) -> 
         ("keyframes", count(summary["keyframes"])),
         ("loop closures", count(summary["loop_closures"])),
         ("relocalisations", count(summary["relocalisations"])),
-        ("scale", summary["scale"]),
+        ("scale", summary["scale"]["sentence"]),
     ]
     if summary["skipped_frames"]:
         rows.insert(1, ("images skipped", count(summary["skipped_frames"])))
@@ -40,30 +42,29 @@ def run_table(summary: dict[str, Any], places: dict[str, str] | None = None) -> 
     if mesh["vertices"] is not None:
         rows.append(("mesh", f"{count(mesh['vertices'])} vertices, {count(mesh['triangles'])} triangles"))
     rows += list((places or {}).items())
-    return _two_columns(f"{summary['sequence']} · depth: {summary['depth_model']}", rows)
+    return two_columns(f"{summary['sequence']} · depth: {summary['depth_model']}", rows)
 
 
 def trajectory_table(figures: dict[str, Any], title: str = "trajectory", digits: int = 6) -> Table:
     """The figures of ``TrajectoryScore.to_dict()``, lengths with so many digits after the point."""
-    return _two_columns(title, _score_rows(figures, digits))
+    return two_columns(title, _score_rows(figures, digits))
 
 
-def depth_table(figures: dict[str, Any], title: str = "depth against the sensor") -> Table:
-    """The figures of ``DepthScore.to_dict()``, judged three ways."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=Text(title, style="bold"), title_justify="left", box=box.SIMPLE)
-    table.add_column("scaled")
-    for name in ("AbsRel", "RMSE", "δ < 1.25"):
-        table.add_column(name, justify="right")
-    ways = (("metric", "as predicted"), ("sequence_median", "once"), ("frame_median", "each frame"))
-    for key, label in ways:
-        errors = figures[key]
-        rmse = fixed(errors["rmse_m"], 3, "m")
-        table.add_row(label, fixed(errors["abs_rel"], 3), rmse, fixed(errors["delta1"], 3))
-    return table
+def scale_table(fit: ScaleFit) -> Table:
+    """A scale fitted to a sensor, with how sure it is."""
+    unit = fit.scale.domain.shift_unit
+    has_shift = fit.shift_sigma is not None or fit.scale.shift != 0.0
+    sure = "one frame: unknown" if fit.scale_sigma_log is None else f"± {percent(fit.scale_sigma_log)}"
+    rows = [
+        (f"scale of {fit.scale.domain.value}", f"{fit.scale.scale:.4g}{'' if has_shift else f' {sure}'}"),
+        ("frames", f"{count(fit.frames)}, {count(fit.pixels)} pixels"),
+        ("spread over frames", f"{fit.frame_spread_log:.3f} (std of the log of each frame's own factor)"),
+    ]
+    if has_shift:
+        shift_sigma = MISSING if fit.shift_sigma is None else f"± {fit.shift_sigma:.3g} {unit}"
+        rows.insert(1, ("shift", f"{fit.scale.shift:.4g} {shift_sigma}"))
+        rows.insert(2, ("depth by both", f"{sure} at the middle depth"))
+    return two_columns(f"{fit.model} on {fit.sequence}", rows)
 
 
 def _score_rows(figures: dict[str, Any], digits: int) -> Rows:
@@ -82,7 +83,7 @@ def _score_rows(figures: dict[str, Any], digits: int) -> Rows:
     return rows
 
 
-def _two_columns(title: str, rows: Rows) -> Table:
+def two_columns(title: str, rows: Rows) -> Table:
     """Texts are shown as they are: a path with brackets is no markup."""
     from rich import box
     from rich.table import Table

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from slamdepth.config import Config
 from slamdepth.evaluation import DepthScore, TrajectoryScore
+from slamdepth.report.scale import ScaleFacts
 from slamdepth.types import Reconstruction, StepResult, WeightsInfo
 
 
@@ -28,7 +29,7 @@ class ReportData:
         reconstruction: what the tracker returned.
         fps: frames over the wall time of tracking, meshing apart.
         config: every setting of the run.
-        scale: one sentence: is the map metric, and how was its scale found.
+        scale: is the map metric, and how was its scale found.
         weights: every weights file that took part, and the data each has seen.
         steps: one result for each frame, in order; empty where they were not kept.
         trajectory_score, depth_score, mesh: None where there is none.
@@ -43,7 +44,7 @@ class ReportData:
     reconstruction: Reconstruction
     fps: float
     config: Config
-    scale: str
+    scale: ScaleFacts
     weights: tuple[WeightsInfo, ...] = ()
     steps: tuple[StepResult, ...] = ()
     trajectory_score: TrajectoryScore | None = None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures as inline SVG whose colours follow the page, so that they suit light and dark.
+"""Figures as PNG, or as inline SVG whose colours follow the page, so that they suit light and dark.
 
-Matplotlib's object-oriented API alone is used: no pyplot, no global figure state. Colours
-are drawn as placeholders and exchanged for CSS variables in the finished SVG.
+Matplotlib's object-oriented API alone is used: no pyplot, no global figure state. Colours of
+SVG are drawn as placeholders and exchanged for CSS variables in the finished file.
 """
 
 from __future__ import annotations
@@ -10,7 +10,10 @@ from __future__ import annotations
 import html
 import io
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from slamdepth.io import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -84,6 +87,23 @@ def legend_above(axes: Any, columns: int = 4, handles: Iterable[Any] | None = No
         axes.legend(**options)
     else:
         axes.legend(handles=list(handles), **options)
+
+
+def to_png(figure: Any, dpi: int = 120) -> bytes:
+    """The figure as a PNG file, which does not name the matplotlib that drew it."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def write_png(figure: Any, path: Path) -> None:
+    """Write the figure to ``path``.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with replacing(path) as partial:
+        partial.write_bytes(to_png(figure))
 
 
 def to_svg(figure: Any, description: str) -> str:

@@ -39,7 +39,7 @@ def build_html(data: ReportData, summary: dict[str, Any]) -> str:
 
 def _header(summary: dict[str, Any]) -> str:
     depth = "sensor depth" if summary["depth_model"] == "sensor" else f"depth by {summary['depth_model']}"
-    lead = f"{depth} · {count(summary['frames'])} frames. {summary['scale']}"
+    lead = f"{depth} · {count(summary['frames'])} frames. {summary['scale']['sentence']}"
     return (
         f'<header><div class="product">slamdepth {escape(str(summary["versions"]["slamdepth"]))} · run report'
         f"</div><h1>{escape(summary['sequence'])}</h1>"
@@ -63,15 +63,26 @@ def _tiles(summary: dict[str, Any]) -> str:
         tiles.append(tile("mesh", count(summary["mesh"]["triangles"]), f"triangles, {vertices}"))
     if ate["se3"]["rmse_m"] is not None:
         metric, scaled = ate["se3"]["rmse_m"], ate["sim3"]["rmse_m"]
+        is_given = summary["scale"]["from_ground_truth"]
+        how = "scale from ground truth: no metric claim" if is_given else "scale as estimated"
         tiles += [
-            tile("ATE, SE(3)", fixed(100 * metric, 2, "cm"), "RMSE, scale as estimated"),
+            tile("ATE, SE(3)", fixed(100 * metric, 2, "cm"), f"RMSE, {how}"),
             tile("ATE, Sim(3)", fixed(100 * scaled, 2, "cm"), "RMSE, scale corrected"),
             tile("scale", f"× {fixed(ate['sim3']['scale'], 3)}", "would correct the estimate"),
         ]
     depth = summary["depth"]["metric"]
     if depth["abs_rel"] is not None:
-        tiles.append(tile("depth AbsRel", fixed(depth["abs_rel"], 3), "as predicted, against the sensor"))
+        tiles.append(
+            tile("depth AbsRel", fixed(depth["abs_rel"], 3), f"{_as_predicted(summary)}, against the sensor")
+        )
     return f'<div class="tiles">{"".join(tiles)}</div>\n'
+
+
+def _as_predicted(summary: dict[str, Any]) -> str:
+    """Predictions are judged as the tracker saw them."""
+    scale = summary["scale"]
+    is_scaled = scale["prediction_factor"] != 1.0 or scale["shift"] is not None
+    return "as predicted, depth scale applied" if is_scaled else "as predicted"
 
 
 def _notes(summary: dict[str, Any]) -> str:
@@ -165,7 +176,7 @@ def _depth(data: ReportData, summary: dict[str, Any]) -> str:
             "Each figure is the mean over frames."
         )
         ways = (
-            ("metric", "as predicted"),
+            ("metric", _as_predicted(summary)),
             ("sequence_median", f"one factor for the sequence, {fixed(score['sequence_scale'], 3)}"),
             ("frame_median", "one factor for each frame"),
         )
@@ -230,7 +241,7 @@ def _speed(summary: dict[str, Any]) -> str:
 
 
 def _provenance(data: ReportData, summary: dict[str, Any]) -> str:
-    body = f"<h3>Scale</h3><p>{escape(summary['scale'])}</p><h3>Weights</h3>"
+    body = f"<h3>Scale</h3><p>{escape(summary['scale']['sentence'])}</p><h3>Weights</h3>"
     if summary["weights"]:
         rows = [[w["name"], w["trained_on"], w["licence"], w["sha256"]] for w in summary["weights"]]
         body += table(["weights", "data they have seen", "licence", "sha256"], rows, text=True)

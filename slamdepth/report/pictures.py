@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -46,17 +46,33 @@ class Gallery:
     far_m: float
 
 
-def colour_depth(depth_m: NDArray[np.floating], near_m: float, far_m: float) -> NDArray[np.uint8]:
-    """Colours ``(H, W, 3)`` RGB of depth ``(H, W)`` in metres; grey where it is 0 or not finite."""
-    anchors = np.array([_rgb(colour) for colour in NEAR_TO_FAR], dtype=np.float64)
-    known = np.isfinite(depth_m) & (depth_m > 0)
-    position = np.clip((np.where(known, depth_m, near_m) - near_m) / max(far_m - near_m, 1e-9), 0.0, 1.0)
+def colour_depth(
+    depth_m: NDArray[np.floating], near_m: float, far_m: float, known: NDArray[np.bool_] | None = None
+) -> NDArray[np.uint8]:
+    """Colours ``(H, W, 3)`` RGB of depth ``(H, W)`` in metres, from dark blue at ``near_m`` to
+    yellow at ``far_m``; grey where it is 0 or not finite.
+
+    Values of another unit are coloured alike, also where ``near_m`` is the larger one (inverse
+    depth); then ``known (H, W)`` says which pixels have a value, for 0 may be one.
+    """
+    anchors = np.array([rgb_of(colour) for colour in NEAR_TO_FAR], dtype=np.float64)
+    if known is None:
+        known = np.isfinite(depth_m) & (depth_m > 0)
+    span = far_m - near_m if abs(far_m - near_m) > 1e-9 else 1e-9
+    position = np.clip((np.where(known, depth_m, near_m) - near_m) / span, 0.0, 1.0)
     levels = np.linspace(0.0, 1.0, len(anchors))
     table_at = np.linspace(0.0, 1.0, 256)
     channels = [np.interp(table_at, levels, channel).round() for channel in anchors.T]
     coloured = np.stack(channels, axis=1).astype(np.uint8)[np.round(position * 255).astype(np.int64)]
-    coloured[~known] = _rgb(UNKNOWN)
+    coloured[~known] = rgb_of(UNKNOWN)
     return coloured
+
+
+def near_to_far() -> Any:
+    """The colours of :func:`colour_depth` as a matplotlib colour map."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("near to far", NEAR_TO_FAR).with_extremes(bad=UNKNOWN)
 
 
 def keyframe_gallery(keyframes: tuple[Keyframe, ...], count: int = 4) -> Gallery | None:
@@ -93,5 +109,6 @@ def _jpeg(image_rgb: NDArray[np.uint8], *, smooth: bool) -> str:
     return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 
-def _rgb(colour: str) -> tuple[int, int, int]:
+def rgb_of(colour: str) -> tuple[int, int, int]:
+    """The channels of ``#rrggbb``."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

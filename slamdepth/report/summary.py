@@ -17,7 +17,7 @@ def build_summary(data: ReportData) -> dict[str, Any]:
     return {
         "sequence": data.sequence,
         "depth_model": data.depth_model,
-        "scale": data.scale,
+        "scale": data.scale.to_dict(),
         "frames": run.frames,
         "tracked": run.tracked,
         "tracked_fraction": run.tracked / run.frames if run.frames else None,
@@ -36,7 +36,7 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         },
         "notes": [*data.notes, *run.notes],
         "weights": [asdict(weights) for weights in data.weights],
-        "settings": data.config.model_dump(mode="json"),
+        "settings": data.config.for_report(),
         "options": dict(data.options),
         "versions": versions(),
         "hardware": hardware(),

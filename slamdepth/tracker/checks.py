@@ -17,7 +17,9 @@ def model_for(depth_model: DepthModel | None, config: Config) -> DepthModel:
         ConfigError: no model has that name, or its predictions are relative.
         WeightsError: its weights are not there.
     """
-    model = depth_model or create_depth_model(config.depth.name, device=config.device, seed=config.seed)
+    model = depth_model or create_depth_model(
+        config.depth.name, device=config.device, seed=config.seed, weights=config.depth.weights
+    )
     check_model(model)
     return model
 
@@ -30,7 +32,9 @@ def check_model(model: DepthModel) -> None:
     """
     if model.kind is not DepthKind.METRIC:
         raise ConfigError(
-            f"depth model '{model.name}' predicts {model.kind.value}; tracking needs a metric depth model"
+            f"depth model '{model.name}' predicts {model.kind.value}; tracking needs metres: "
+            "take a metric model, or fit scale and shift with 'slamdepth scale SEQ --shift --output FILE' "
+            "and pass them (--depth-scale FILE)"
         )
 
 

@@ -152,8 +152,6 @@ class CloudTracker:
         if not self._poses:
             raise TrackingError("no frame could be placed: no depth in range")
         self._finished = True
-        is_sensor = self._keyframes[0].prediction.is_sensor
-        note = "scale: that of the sensor" if is_sensor else "scale: that of the predicted depth, as it is"
         return Reconstruction(
             trajectory=Trajectory(np.array(self._times), np.stack(self._poses)),
             keyframes=tuple(self._keyframes),
@@ -164,5 +162,4 @@ class CloudTracker:
             relocalisations=0,
             rescues=0,
             timings_ms={stage: float(np.mean(values)) for stage, values in self._totals.items()},
-            notes=(note,),
         )

@@ -30,9 +30,14 @@ _MAX_KEYFRAMES = 600  # beyond, the reduced camera system outgrows a laptop's me
 
 def optimise_everything(
     landmarks: LandmarkMap, mapper: LocalMapper, frames: FrameLog, config: Config
-) -> list[str]:
-    """Global bundle adjustment and metric scale; returns notes."""
-    notes = []
+) -> tuple[list[str], tuple[float, ...]]:
+    """Global bundle adjustment and metric scale.
+
+    Returns:
+        Notes, and the keyframes' votes on the scale; see ``Reconstruction.scale_votes``.
+    """
+    notes: list[str] = []
+    votes: tuple[float, ...] = ()
     keyframes = landmarks.keyframes
     if config.bundle.final and 3 <= len(keyframes) <= _MAX_KEYFRAMES:
         rows = np.flatnonzero(
@@ -46,19 +51,22 @@ def optimise_everything(
         )
     prediction = keyframes[0].prediction
     if prediction is not None and not prediction.is_sensor:
-        notes.append(_make_metric(landmarks, frames))
-    return notes
+        votes = _make_metric(landmarks, frames)
+    return notes, votes
 
 
-def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> str:
+def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> tuple[float, ...]:
     """Scale the map so that it agrees with the depth network over all keyframes, not with any one.
 
     Each keyframe votes with the median log ratio of its map depths to its prediction; the
-    votes' median is taken out.
+    votes' median is taken out. Without votes the scale stays that of the first keyframe.
+
+    Returns:
+        The votes after that.
     """
     votes = np.array([v for k in landmarks.keyframes if (v := _scale_vote(landmarks, k)) is not None])
     if len(votes) == 0:
-        return "scale: that of the first keyframe's predicted depth; no keyframe could vote"
+        return ()
     offset = float(np.median(votes))
     factor = float(np.exp(-offset))
     n = landmarks.size
@@ -70,11 +78,7 @@ def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> str:
         keyframe.scale *= factor
     landmarks.refresh_views(np.arange(n))
     frames.rescale(np.full(len(landmarks.keyframes), factor))
-    spread = float(np.std(votes))
-    return (
-        f"scale: from predicted depth, the median over {len(votes)} keyframes "
-        f"(their log ratios spread by {spread:.2f}); true metres may differ by some ten per cent"
-    )
+    return tuple(float(vote) for vote in votes - offset)
 
 
 def _scale_vote(landmarks: LandmarkMap, keyframe: MapKeyframe) -> float | None:
@@ -102,6 +106,7 @@ def build_reconstruction(
     rescues: int,
     timings_ms: dict[str, float],
     notes: list[str],
+    scale_votes: tuple[float, ...] = (),
 ) -> Reconstruction:
     """The value handed to the user, with every frame placed anew where ``refine_frames``."""
     # depth images are large, and NumPy makes them in other threads while this one places frames
@@ -122,6 +127,7 @@ def build_reconstruction(
         rescues=rescues,
         timings_ms=timings_ms,
         notes=tuple(notes),
+        scale_votes=scale_votes,
     )
 
 

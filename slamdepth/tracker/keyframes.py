@@ -124,7 +124,9 @@ class Keyframes:
         with self._timed("mapping"):
             keyframe = self._mapper.insert(frame, features, placement.T_camera_world, placement.point_ids)
         self._reference_overlap, self._still, self._seen_share = 0.0, 0, 1.0
-        delay = 0 if self._depth.is_instant(frame) else self._config.tracking.depth_delay
+        # the first few are waited for: all that follows stands on the points born there
+        at_once = self._depth.is_instant(frame) or len(self._map.keyframes) <= _START_KEYFRAMES
+        delay = 0 if at_once else self._config.tracking.depth_delay
         self._waiting = _Waiting(keyframe, delay)
         return keyframe
 

@@ -284,7 +284,7 @@ class Tracker:
             self._join()
             self._depth.close()
             with self._watch.timed("final"):
-                notes = optimise_everything(self._map, self._mapper, self._log, self.config)
+                notes, votes = optimise_everything(self._map, self._mapper, self._log, self.config)
             return build_reconstruction(
                 self._map,
                 self._mapper,
@@ -296,4 +296,5 @@ class Tracker:
                 rescues=self._rescues,
                 timings_ms=self._watch.mean_ms(),
                 notes=notes,
+                scale_votes=votes,
             )

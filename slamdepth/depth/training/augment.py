@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.depth.training.config import AugmentConfig
+from slamdepth.depth.training.lens import raw_pixels
 from slamdepth.geometry import so3_exp
 from slamdepth.types import Frame
 
@@ -60,6 +61,41 @@ def plain_view(frame: Frame, rows: int, columns: int) -> View:
     return View(*turned_view(frame, rows, columns, 0.0, 0.0, 0.0, 1.0, False))
 
 
+def mixed_view(first: View, second: View) -> View:
+    """Both scenes in one: of each pixel what is nearer, at the focal length of ``first``.
+
+    Two pairs are put into one canonical camera, so that sizes and depths stay true, and
+    occlude one another as solid scenes would. What a network can learn by heart of a place
+    (this counter, so that wall) is broken up; what a surface itself tells of its depth stays.
+    Where a sensor saw nothing the depth of the nearest pixel decides, and the result is unknown.
+    """
+    factor = np.float32(first.focal_px / second.focal_px)
+    second_m = second.depth_m * factor
+    in_front = _completed(first.depth_m) <= _completed(second_m)
+    return View(
+        np.where(in_front[..., None], first.image_rgb, second.image_rgb),
+        np.where(in_front, first.depth_m, second_m),
+        first.focal_px,
+    )
+
+
+def _completed(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``(H, W)`` with each unknown pixel given the depth of the nearest known one."""
+    import cv2
+
+    unknown = depth_m <= 0
+    if unknown.all():
+        return np.full_like(depth_m, np.inf)
+    if not unknown.any():
+        return depth_m
+    _, label = cv2.distanceTransformWithLabels(
+        unknown.astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(label.max()) + 1, np.float32)
+    of_label[label[~unknown]] = depth_m[~unknown]
+    return of_label[label]
+
+
 def turned_view(
     frame: Frame,
     rows: int,
@@ -72,6 +108,7 @@ def turned_view(
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], float]:
     """Image, depth and focal length (px) of ``frame`` after an exact camera rotation.
 
+    The view is that of a pinhole: lens distortion of ``frame.camera`` is undone.
     Pixels from outside the frame mirror its border and have depth 0.
     """
     import cv2
@@ -87,7 +124,7 @@ def turned_view(
     u, v = np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64))
     rays_view = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K_view).T
     rays = rays_view @ R_camera_view.T
-    pixels = (rays / rays[..., 2:]) @ camera.K.T
+    pixels = raw_pixels(rays, camera)
     map_x, map_y = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
     image: NDArray[Any] = cv2.remap(
         frame.image_rgb, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from slamdepth.errors import ConfigError
 
@@ -31,10 +31,14 @@ class AugmentConfig(_Section):
     blur: float = Field(0.3, ge=0, le=1, description="share of blurred images")
     noise: float = Field(0.3, ge=0, le=1, description="share of images with sensor noise")
     jpeg: float = Field(0.5, ge=0, le=1, description="share of images compressed again")
+    mixed: float = Field(
+        0.0, ge=0, le=1, description="share of views into which another is put, the nearer surface in front"
+    )
+    mixed_again: float = Field(0.35, ge=0, le=1, description="share of those into which a third is put")
 
 
 class PlaceConfig(_Section):
-    """One folder of training pairs: one place, one camera."""
+    """One place, one camera: a folder of pairs, a sequence or a scene."""
 
     name: str = Field(description="folder below the data folder")
     samples: int = Field(200, ge=1, description="augmented samples drawn from it, spread over its frames")
@@ -44,7 +48,11 @@ class SourceConfig(_Section):
     """A folder of places. Each source has a feature cache of its own."""
 
     folder: str = Field(description="folder of the places; relative to $SLAMDEPTH_DATA if not absolute")
+    reader: str | None = Field(
+        None, description="layout: pairs, hypersim, synth, tum, 7scenes; found out from the files if absent"
+    )
     places: tuple[PlaceConfig, ...] = Field((), description="trained on")
+    augment: AugmentConfig | None = Field(None, description="of this source's views; view.augment if absent")
     held_out: tuple[str, ...] = Field((), description="places judged on after training, never trained on")
     limit: int | None = Field(
         None, ge=1, description="only so many of the samples, a random choice; leaves the others' views alone"
@@ -80,6 +88,27 @@ class LossConfig(_Section):
     gradient: float = Field(0.5, ge=0, description="multi-scale gradients of the log error")
 
 
+class SearchRange(_Section):
+    """Where ``--search`` looks for one setting: between ``low`` and ``high``, or among ``choices``."""
+
+    low: float | None = None
+    high: float | None = None
+    log: bool = Field(False, description="spread evenly over magnitudes")
+    choices: tuple[float, ...] | None = Field(None, min_length=1)
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> SearchRange:
+        bounds = (self.low, self.high)
+        if self.choices is not None:
+            if bounds != (None, None) or self.log:
+                raise ValueError("give either choices or low and high")
+        elif self.low is None or self.high is None or self.low >= self.high:
+            raise ValueError("needs low and a higher high, or choices")
+        elif self.log and self.low <= 0:
+            raise ValueError("log needs a low above 0")
+        return self
+
+
 class TrainConfig(_Section):
     """One training run."""
 
@@ -101,6 +130,17 @@ class TrainConfig(_Section):
     view: ViewConfig = ViewConfig()
     head: HeadConfig = HeadConfig()
     loss: LossConfig = LossConfig()
+    search: dict[str, SearchRange] = Field(
+        {}, description="settings that --search tunes, by their dotted name, such as head.dim"
+    )
+
+    @field_validator("search")
+    @classmethod
+    def _are_searchable(cls, search: dict[str, SearchRange]) -> dict[str, SearchRange]:
+        for name in search:
+            if name not in SEARCHABLE:
+                raise ValueError(f"'{name}' cannot be searched; choose from: {', '.join(SEARCHABLE)}")
+        return search
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> TrainConfig:
@@ -131,8 +171,23 @@ class TrainConfig(_Section):
         except ValidationError as error:
             problem = error.errors()[0]
             name = ".".join(str(part) for part in problem["loc"]) or "(top level)"
-            what = "unknown setting" if problem["type"] == "extra_forbidden" else problem["msg"]
+            message = problem["msg"].removeprefix("Value error, ")
+            what = "unknown setting" if problem["type"] == "extra_forbidden" else message
             raise ConfigError(f"{origin}: setting '{name}': {what}") from error
+
+
+def _numbers(section: type[BaseModel], prefix: str = "", left_out: tuple[str, ...] = ()) -> dict[str, bool]:
+    kinds = {key: field.annotation for key, field in section.model_fields.items() if key not in left_out}
+    return {prefix + key: kind is int for key, kind in kinds.items() if kind in (int, float)}
+
+
+# What decides on the features, the places or the size of the file is not for a search.
+SEARCHABLE: dict[str, bool] = {
+    **_numbers(TrainConfig, left_out=("seed", "members", "sigma_scale")),
+    **_numbers(HeadConfig, "head."),
+    **_numbers(LossConfig, "loss."),
+}
+"""Settings that can be searched, by dotted name; True where they are whole numbers."""
 
 
 def digest(section: BaseModel, *more: object) -> str:

@@ -1,111 +1,164 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readers of training pairs: a folder a place, with ``camera.json`` and image + depth files."""
+"""Where training images with depth come from: places, and the readers that open them.
+
+A reader is one file in ``slamdepth/depth/training/readers/`` with a class under
+``@register_reader``. Whoever starts a training may hand in more of them; that is how
+the sequence layouts of ``slamdepth.datasets``, which this room does not know, get here.
+"""
 
 from __future__ import annotations
 
-import json
+import hashlib
+import importlib
+import logging
 import os
-from dataclasses import dataclass
+import pkgutil
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Protocol, TypeVar
 
 from slamdepth.errors import DatasetError
 from slamdepth.types import Camera, Frame
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-_IMAGE_ENDINGS = (".jpg", ".jpeg")
+logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Place:
-    """Pairs of one place taken by one camera.
+class Place(Protocol):
+    """Images with depth taken by one camera, read one at a time.
 
     Attributes:
-        images, depths: file paths, in the same order.
-        depth_unit_m: metres per unit of the depth files.
+        name: short name; the views made of it are random by seed and name.
+        camera: the camera of all its images.
+        notes: what was guessed, dropped or repaired while opening it, one line each.
+        benchmark: the benchmark a head trained on it has seen, or None.
+        fingerprint: differs where another file, size or camera would give other views.
     """
 
-    name: str
-    camera: Camera
-    images: tuple[Path, ...]
-    depths: tuple[Path, ...]
-    depth_unit_m: float
+    @property
+    def name(self) -> str: ...
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def notes(self) -> tuple[str, ...]: ...
+    @property
+    def benchmark(self) -> str | None: ...
+    @property
+    def fingerprint(self) -> str: ...
 
-    def __len__(self) -> int:
-        return len(self.images)
+    def __len__(self) -> int: ...
 
     def read(self, index: int) -> Frame:
-        """The pair ``index`` as a frame with depth.
+        """Image ``index`` with its depth in metres, both in raw pixels of :attr:`camera`.
 
         Raises:
             DatasetError: a file does not decode or has another size than the camera's.
         """
-        image_rgb = _decode(self.images[index], colour=True)
-        raw = _decode(self.depths[index], colour=False)
-        expected = (self.camera.height, self.camera.width)
-        for path, array in ((self.images[index], image_rgb), (self.depths[index], raw)):
-            if array.shape[:2] != expected:
-                raise DatasetError(f"{path}: {array.shape[:2]} pixels, camera.json says {expected}")
-        depth_m = (raw.astype(np.float32) * self.depth_unit_m).astype(np.float32)
-        return Frame(index, float(index), image_rgb, self.camera, depth_m)
+        ...
+
+
+class PlaceReader(Protocol):
+    """Opens the folders of one layout.
+
+    Attributes:
+        name: what a source's ``reader`` says.
+        needs: the files it needs, as a user should read them.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def needs(self) -> str: ...
+
+    def matches(self, folder: Path) -> bool:
+        """True where ``folder`` is meant to have this layout, whole or not."""
+        ...
+
+    def open(self, folder: Path) -> Place:
+        """Open ``folder``.
+
+        Raises:
+            DatasetError: a file is missing or malformed, or there is no depth.
+        """
+        ...
+
+
+_ReaderType = TypeVar("_ReaderType", bound=PlaceReader)
+_readers: dict[str, PlaceReader] = {}
+
+
+def register_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
+    """Class decorator that makes a :class:`PlaceReader` known by its name."""
+    reader = reader_type()
+    if reader.name in _readers:
+        raise ValueError(f"two readers of training data are named {reader.name!r}")
+    _readers[reader.name] = reader
+    return reader_type
+
+
+def known_readers() -> dict[str, PlaceReader]:
+    """The readers of this room, by name."""
+    from slamdepth.depth.training import readers
+
+    for module in pkgutil.iter_modules(readers.__path__):
+        importlib.import_module(f"{readers.__name__}.{module.name}")
+    return dict(sorted(_readers.items()))
+
+
+def open_place(
+    folder: Path, reader: str | None = None, more_readers: Mapping[str, PlaceReader] | None = None
+) -> Place:
+    """Open a folder of images with depth.
+
+    Args:
+        reader: name of the reader; None takes the first whose layout the folder has.
+        more_readers: further readers, after those of this room.
+
+    Raises:
+        DatasetError: the folder is missing or of no known layout, there is no such
+            reader, or the reader finds a file missing or malformed.
+    """
+    readers = {**known_readers(), **(more_readers or {})}
+    if reader is not None and reader not in readers:
+        raise DatasetError(f"unknown reader '{reader}' of training data; choose from: {', '.join(readers)}")
+    if not folder.is_dir():
+        raise DatasetError(f"{folder}: no such folder")
+    try:
+        found = reader or next((name for name in readers if readers[name].matches(folder)), None)
+        if found is None:
+            layouts = "; ".join(f"{name} ({known.needs})" for name, known in readers.items())
+            raise DatasetError(f"{folder}: no known layout of training data; known are: {layouts}")
+        place = readers[found].open(folder)
+    except OSError as error:
+        raise DatasetError(f"{folder}: cannot be read: {error.strerror or error}") from error
+    logger.info("%s: %d images with depth, read as '%s'", folder, len(place), found)
+    for note in place.notes:
+        logger.info("%s: %s", place.name, note)
+    return place
 
 
 def data_folder(named: str) -> Path:
     """An absolute folder as it is; another one below ``$SLAMDEPTH_DATA`` where that is
-    set, else relative to the current folder.
+    set, else relative to the current folder. Environment variables and ``~`` are expanded.
 
     Raises:
         DatasetError: it does not exist.
     """
-    path = Path(named).expanduser()
+    path = Path(os.path.expandvars(named)).expanduser()
     root = os.environ.get("SLAMDEPTH_DATA")
     if not path.is_absolute() and root and not path.is_dir():
         path = Path(root) / path
     if not path.is_dir():
-        raise DatasetError(f"{path}: no such folder of training pairs (is SLAMDEPTH_DATA set?)")
+        raise DatasetError(f"{path}: no such folder (is SLAMDEPTH_DATA set?)")
     return path
 
 
-def open_place(folder: Path) -> Place:
-    """Open a folder of ``NNNNN.jpg`` + ``NNNNN.png`` pairs.
+def fingerprint(paths: Iterable[Path], *more: object) -> str:
+    """Short hash of the names and sizes of files, and of ``more``.
 
     Raises:
-        DatasetError: the folder, ``camera.json`` or one of its keys is missing, or there
-            is no complete pair.
+        OSError: a file is gone.
     """
-    about = folder / "camera.json"
-    if not about.is_file():
-        raise DatasetError(f"{folder}: no camera.json here, so this is no folder of training pairs")
-    try:
-        values = json.loads(about.read_text(encoding="utf-8"))
-        camera = Camera(
-            int(values["width"]), int(values["height"]),
-            float(values["fx"]), float(values["fy"]), float(values["cx"]), float(values["cy"]),
-        )  # fmt: skip
-        unit = float(values.get("depth_unit_m", 0.001))
-    except KeyError as error:
-        raise DatasetError(f"{about}: the key {error} is missing") from error
-    except (OSError, ValueError, TypeError) as error:
-        raise DatasetError(f"{about}: not readable: {error}") from error
-    images = sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGE_ENDINGS)
-    pairs = [(path, path.with_suffix(".png")) for path in images if path.with_suffix(".png").is_file()]
-    if not pairs:
-        raise DatasetError(f"{folder}: no pair of NNNNN.jpg and NNNNN.png here")
-    return Place(folder.name, camera, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), unit)
-
-
-def _decode(path: Path, *, colour: bool) -> NDArray[Any]:
-    import cv2
-
-    array = cv2.imread(str(path), cv2.IMREAD_COLOR if colour else cv2.IMREAD_UNCHANGED)
-    if array is None:
-        raise DatasetError(f"{path}: does not decode")
-    if colour:
-        return np.ascontiguousarray(array[:, :, ::-1])
-    if array.ndim != 2:
-        raise DatasetError(f"{path}: a depth image needs one channel, this has {array.shape[-1]}")
-    return array
+    hashed = hashlib.sha256(repr(more).encode())
+    for path in paths:
+        hashed.update(f"{path.name}:{path.stat().st_size}\n".encode(errors="surrogateescape"))
+    return hashed.hexdigest()[:16]

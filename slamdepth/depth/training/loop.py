@@ -11,79 +11,67 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from slamdepth.depth import weights as store
+from slamdepth.depth.checkpoints import check_device
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2
 from slamdepth.depth.head import DepthHead, HeadEnsemble, HeadShape, save_head
-from slamdepth.depth.preprocess import normalised
-from slamdepth.depth.training.config import SourceConfig, TrainConfig, digest
-from slamdepth.depth.training.data import data_folder, open_place
-from slamdepth.depth.training.features import FeatureCache, build_cache, plan_plain, plan_samples
+from slamdepth.depth.training.caches import PlannedCache, benchmarks_seen, fill_cache, plan_caches
+from slamdepth.depth.training.checkpoint import (
+    checkpoint_path,
+    load_checkpoint,
+    remove_checkpoints,
+    save_checkpoint,
+    sync_file,
+)
+from slamdepth.depth.training.config import TrainConfig, digest
+from slamdepth.depth.training.data import PlaceReader
+from slamdepth.depth.training.features import FeatureCache, load_batch
+from slamdepth.depth.training.judge import held_out_figures, judge, sample_views
 from slamdepth.depth.training.losses import total_loss
-from slamdepth.errors import ConfigError, OutputError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from slamdepth.depth.training.progress import Progress, TrainStep, silent
+from slamdepth.depth.training.results import EpochFigures, TrainResult
+from slamdepth.depth.training.stages import FINE_COST, predict
+from slamdepth.errors import OutputError
 
 logger = logging.getLogger(__name__)
 
-Progress = Callable[[str, float], None]
-COARSE = 7
-_JUDGED_VIEWS = 50
 _ONE_SIGMA = 0.6827
-
-
-@dataclass(frozen=True)
-class TrainResult:
-    """What a training made.
-
-    Attributes:
-        output: the head file.
-        losses: ``(members, epochs)`` mean training loss.
-        held_out: for each held-out place, the figures of :func:`judge`.
-        sigma_scale: factor on sigma stored in the head.
-    """
-
-    output: Path
-    losses: NDArray[np.float64]
-    held_out: dict[str, dict[str, float]]
-    sigma_scale: float
+_SAMPLES = 6
 
 
 def train_depth(
     config: TrainConfig,
     *,
     device: str = "cpu",
-    progress: Progress | None = None,
+    progress: Progress = silent,
     backbone: DinoV2 | None = None,
+    readers: Mapping[str, PlaceReader] | None = None,
+    on_result: Callable[[TrainResult], None] | None = None,
 ) -> TrainResult:
     """Train the heads of ``config``, judge them on its held-out places, write the file.
 
     Args:
         backbone: use this instead of the weights ``config`` names (for tests).
+        readers: readers of places beside those of :mod:`slamdepth.depth.training.readers`.
+        on_result: called with the result while the checkpoints are still there, so that a
+            training killed in it need not be done again.
 
     Raises:
-        ConfigError: a place is both trained on and held out.
+        ConfigError: a place is both trained on and held out, or the device is not there.
         DatasetError: a place is missing or malformed.
         WeightsError: the backbone is missing or damaged.
         OutputError: the output cannot be written.
     """
-    tell = progress or (lambda what, share: None)
-    trained = {(s.folder, place.name) for s in config.sources for place in s.places}
-    both = trained & {(s.folder, name) for s in config.sources for name in s.held_out}
-    if both:
-        raise ConfigError(f"setting 'sources': {min(both)[1]} is held out and also trained on")
-    if not trained:
-        raise ConfigError("setting 'sources': there is no place to train on")
+    check_device(device)
     output = Path(config.output)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -95,28 +83,33 @@ def train_depth(
         backbone_sha256 = store.verify(file)
         backbone = load_dinov2(file, device)
 
-    taps = config.head.taps
+    planned = plan_caches(config, backbone_sha256, readers)
+    seen = [f"{benchmark} ({', '.join(names)})" for benchmark, names in benchmarks_seen(planned).items()]
+    for benchmark in seen:
+        logger.warning("trained on %s: figures of this head on it are not zero-shot", benchmark)
     caches = [
-        cache
-        for source in config.sources
-        if (cache := _training_cache(source, config, backbone, backbone_sha256, device, progress)) is not None
+        fill_cache(plan, config, backbone, device=device, progress=progress, stage=_stage(plan, k, planned))
+        for k, plan in enumerate(planned)
     ]
+    training = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is None]
+    judging = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None]
     shape = HeadShape(
-        taps, backbone.dim, config.head.dim, config.head.blocks, config.head.guide_dim, config.members
-    )
+        config.head.taps, backbone.dim, config.head.dim, config.head.blocks, config.head.guide_dim,
+        config.members,
+    )  # fmt: skip
+    key = digest(config, [plan.folder.name for plan in planned])
     ensemble = HeadEnsemble(shape)
-    losses = []
+    history: list[EpochFigures] = []
     for member in range(config.members):
-        head, history = _train_member(config, caches, shape, member, device, tell)
+        head, epochs = _train_member(config, training, judging, shape, member, key, device, progress)
         ensemble.members[member].load_state_dict(head.state_dict())
-        losses.append(history)
+        history += epochs
     ensemble.eval().to(device)
 
     held_out, ratios = {}, []
-    for source in config.sources:
-        for name in source.held_out:
-            plain = _judging_cache(source, name, config, backbone, backbone_sha256, device, progress)
-            held_out[name], ratio = judge(ensemble, plain, device)
+    for plan, cache in zip(planned, caches, strict=True):
+        if plan.held_out is not None:
+            held_out[plan.held_out], ratio = judge(ensemble, cache, device)
             ratios.append(ratio)
     ensemble.sigma_scale = config.sigma_scale
     if ratios:
@@ -124,140 +117,87 @@ def train_depth(
         ensemble.sigma_scale = float(np.mean([np.quantile(ratio, _ONE_SIGMA) for ratio in ratios]))
     names = ", ".join(place.name for source in config.sources for place in source.places)
     about = {
-        "trained_on": config.trained_on or names,
+        "trained_on": "; ".join([config.trained_on or names, *(f"has seen {b}" for b in seen)]),
         "licence": config.licence,
         "seed": str(config.seed),
         "settings": json.dumps(config.model_dump(mode="json"), sort_keys=True),
         "backbone_sha256": backbone_sha256,
     }
+    result = TrainResult(
+        output, tuple(history), held_out, ensemble.sigma_scale,
+        sample_views(ensemble, planned, caches, _SAMPLES, device), _places(planned), about,
+    )  # fmt: skip
     try:
         save_head(output, ensemble, about)
-        for member in range(config.members):
-            _checkpoint_path(config, member).unlink(missing_ok=True)
+        sync_file(output)
+        if on_result is not None:
+            on_result(result)
+        remove_checkpoints(config)
     except OSError as error:
         raise OutputError(f"{output}: cannot be written: {error.strerror}") from error
-    return TrainResult(output, np.array(losses), held_out, ensemble.sigma_scale)
+    return result
 
 
-def judge(
-    ensemble: HeadEnsemble, cache: FeatureCache, device: str
-) -> tuple[dict[str, float], NDArray[np.float64]]:
-    """Figures over the samples of ``cache``, and all ``|log error| / sigma``.
-
-    AbsRel as predicted and after a median per view, delta1 after it, the spread of the
-    views' log scales, and the share of errors below one sigma.
-    """
-    rows: list[list[float]] = []
-    ratios = []
-    for k in range(len(cache)):
-        batch = _batch(cache, np.array([k]), device)
-        with torch.inference_mode():
-            log_depth, sigma = ensemble(*batch[:3])
-        known = batch[3][0] > 0
-        if int(known.sum()) < 100:
-            continue
-        error = (log_depth[0][known] - batch[3][0][known].log()).double().cpu().numpy()
-        ratios.append(np.abs(error) / sigma[0][known].double().cpu().numpy())
-        median = float(np.median(error))
-        scaled = np.exp(error - median)
-        rows.append([
-            float(np.mean(np.abs(np.exp(error) - 1))),
-            float(np.mean(np.abs(scaled - 1))),
-            float(np.mean(np.maximum(scaled, 1 / scaled) < 1.25)),
-            median,
-        ])  # fmt: skip
-    if not rows:
-        return {}, np.ones(1)
-    table = np.array(rows)
-    ratio = np.concatenate(ratios)
-    return {
-        "abs_rel": float(table[:, 0].mean()),
-        "abs_rel_frame_median": float(table[:, 1].mean()),
-        "delta1_frame_median": float(table[:, 2].mean()),
-        "scale_spread": float(table[:, 3].std()),
-        "within_one_sigma": float(np.mean(ratio < 1)),
-    }, ratio
+def _stage(plan: PlannedCache, index: int, planned: list[PlannedCache]) -> str:
+    what = f"held-out {plan.held_out}" if plan.held_out else f"{len(plan.places)} places"
+    return f"features {index + 1} of {len(planned)}, {what}"
 
 
-def _training_cache(
-    source: SourceConfig,
-    config: TrainConfig,
-    backbone: DinoV2,
-    backbone_sha256: str,
-    device: str,
-    progress: Progress | None,
-) -> FeatureCache | None:
-    if not source.places:
-        return None
-    folder = data_folder(source.folder)
-    places = [open_place(folder / place.name) for place in source.places]
-    samples = [place.samples for place in source.places]
-    keys = plan_samples(places, samples, config.seed)[: source.limit]
-    where = _cache_folder(config, backbone_sha256, source.places, source.limit, [len(p) for p in places])
-    return build_cache(
-        where, places, keys, config.view, backbone, config.head.taps, config.seed,
-        device=device, progress=progress,
-    )  # fmt: skip
-
-
-def _judging_cache(
-    source: SourceConfig,
-    name: str,
-    config: TrainConfig,
-    backbone: DinoV2,
-    backbone_sha256: str,
-    device: str,
-    progress: Progress | None,
-) -> FeatureCache:
-    place = open_place(data_folder(source.folder) / name)
-    where = _cache_folder(config, backbone_sha256, "plain", name, len(place))
-    return build_cache(
-        where, [place], plan_plain(0, place, _JUDGED_VIEWS), config.view, backbone, config.head.taps,
-        config.seed, device=device, progress=progress,
-    )  # fmt: skip
-
-
-def _cache_folder(config: TrainConfig, *more: object) -> Path:
-    return store.cache_dir() / "features" / digest(config.view, config.head.taps, config.seed, *more)
+def _places(planned: list[PlannedCache]) -> tuple[dict[str, object], ...]:
+    return tuple(
+        {
+            "name": place.name,
+            "is_held_out": plan.held_out is not None,
+            "images": len(place),
+            "samples": sum(key.place == index for key in plan.keys),
+            "notes": list(place.notes),
+        }
+        for plan in planned
+        for index, place in enumerate(plan.places)
+    )
 
 
 def _train_member(
     config: TrainConfig,
     caches: list[FeatureCache],
+    judging: list[FeatureCache],
     shape: HeadShape,
     member: int,
+    key: str,
     device: str,
-    tell: Progress,
-) -> tuple[DepthHead, list[float]]:
-    seed = config.seed * 1000 + member
+    progress: Progress,
+) -> tuple[DepthHead, list[EpochFigures]]:
+    seed = _seed(config, member)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         head = DepthHead(shape, config.head.dropout).to(device)
         optimiser = torch.optim.AdamW(
             head.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
-        path, key = _checkpoint_path(config, member), digest(config, member)
-        history: list[float] = []
-        if path.is_file():
-            state = torch.load(path, map_location=device, weights_only=True)
-            if state["key"] == key:
-                head.load_state_dict(state["head"])
-                optimiser.load_state_dict(state["optimiser"])
-                history = list(state["history"])
-                logger.info("going on from epoch %d of %s", len(history), path)
-        epochs = config.coarse_epochs + config.fine_epochs
-        for epoch in range(len(history), epochs):
+        path = checkpoint_path(config, member)
+        history: list[EpochFigures] = []
+        if (state := load_checkpoint(path, key, device)) is not None:
+            head.load_state_dict(state["head"])
+            optimiser.load_state_dict(state["optimiser"])
+            history = [EpochFigures(**figures) for figures in state["history"]]
+            logger.info("going on from epoch %d of %s", len(history), path)
+        for epoch in range(len(history), config.coarse_epochs + config.fine_epochs):
             torch.manual_seed(seed + 1_000_003 * (epoch + 1))  # so that a resumed epoch drops the same
-            history.append(_epoch(config, caches, head, optimiser, epoch, seed, device))
-            partial = path.with_name(path.name + ".partial")
-            torch.save(
-                {"key": key, "head": head.state_dict(), "optimiser": optimiser.state_dict(),
-                 "history": history},
-                partial,
+            start = time.perf_counter()
+            loss = _epoch(config, caches, head, optimiser, epoch, member, device, progress)
+            seconds = time.perf_counter() - start
+            is_fine = epoch >= config.coarse_epochs
+            judged = (
+                held_out_figures(head, judging, config.loss, is_fine, device) if judging else (None, None)
+            )
+            history.append(EpochFigures(member, epoch, is_fine, loss, judged[0], judged[1], seconds))
+            save_checkpoint(
+                path,
+                key,
+                {"head": head.state_dict(), "optimiser": optimiser.state_dict(),
+                 "history": [asdict(figures) for figures in history]},
             )  # fmt: skip
-            os.replace(partial, path)
-            logger.info("member %d epoch %d: loss %.4f", member, epoch, history[-1])
-            tell(f"member {member + 1}: loss {history[-1]:.4f}", (epoch + 1) / epochs)
+            logger.info("member %d epoch %d: loss %.4f, held out %s", member, epoch, loss, judged[0])
     return head.eval(), history
 
 
@@ -267,29 +207,25 @@ def _epoch(
     head: DepthHead,
     optimiser: torch.optim.Optimizer,
     epoch: int,
-    seed: int,
+    member: int,
     device: str,
+    progress: Progress,
 ) -> float:
     head.train()
     samples = np.array([(c, k) for c, cache in enumerate(caches) for k in range(len(cache))])
-    order = np.random.default_rng([seed, epoch]).permutation(len(samples))
-    steps = max(1, len(samples) // config.batch)
-    is_fine = epoch >= config.coarse_epochs
+    order = np.random.default_rng([_seed(config, member), epoch]).permutation(len(samples))
+    steps = steps_per_epoch(config, len(samples))
     total = 0.0
     for step in range(steps):
         chosen = samples[np.sort(order[step * config.batch : (step + 1) * config.batch])]
         parts = [
-            _batch(cache, chosen[chosen[:, 0] == c, 1], device)
+            load_batch(cache, chosen[chosen[:, 0] == c, 1], device)
             for c, cache in enumerate(caches)
             if (chosen[:, 0] == c).any()
         ]
         tokens, class_tokens, image, target = (torch.cat(part) for part in zip(*parts, strict=True))
-        if is_fine:
-            prediction = head(tokens, class_tokens, image)
-        else:
-            prediction = head.coarse(tokens, class_tokens, image)[0]
-            target = coarse_target(target)
-        loss = total_loss(prediction, target, config.loss)
+        batch = (tokens, class_tokens, image, target)
+        loss = total_loss(*predict(head, batch, epoch >= config.coarse_epochs), config.loss)
         for group in optimiser.param_groups:
             group["lr"] = learning_rate(config, epoch + step / steps)
         optimiser.zero_grad()
@@ -297,7 +233,27 @@ def _epoch(
         nn.utils.clip_grad_norm_(head.parameters(), 1.0)
         optimiser.step()
         total += float(loss.detach())
+        progress(_how_far(config, member, epoch, step + 1, steps, total / (step + 1)))
     return total / steps
+
+
+def _seed(config: TrainConfig, member: int) -> int:
+    return config.seed * 1000 + member
+
+
+def steps_per_epoch(config: TrainConfig, samples: int) -> int:
+    """Whole batches in an epoch, at least one."""
+    return max(1, samples // config.batch)
+
+
+def _how_far(config: TrainConfig, member: int, epoch: int, step: int, steps: int, loss: float) -> TrainStep:
+    """Progress of a member, in coarse steps."""
+    coarse, fine = min(epoch, config.coarse_epochs), max(0, epoch - config.coarse_epochs)
+    done = steps * (coarse + FINE_COST * fine) + step * (FINE_COST if epoch >= config.coarse_epochs else 1)
+    total = steps * (config.coarse_epochs + FINE_COST * config.fine_epochs)
+    epochs = config.coarse_epochs + config.fine_epochs
+    detail = f"epoch {epoch + 1} of {epochs}, loss {loss:.4f}"
+    return TrainStep(f"member {member + 1} of {config.members}", done, total, detail)
 
 
 def learning_rate(config: TrainConfig, epoch: float) -> float:
@@ -308,28 +264,3 @@ def learning_rate(config: TrainConfig, epoch: float) -> float:
         return config.learning_rate * min(1.0, 0.04 + share / 0.08) * 0.5 * (1 + math.cos(math.pi * share))
     share = (epoch - config.coarse_epochs) / max(1, config.fine_epochs)
     return 0.1 * config.learning_rate * 0.5 * (1 + math.cos(math.pi * min(share, 1.0)))
-
-
-def coarse_target(target: Tensor) -> Tensor:
-    """Median of the known depths of each 7 x 7 block of ``(B, H, W)``; 0 where there are none."""
-    batch, rows, columns = target.shape
-    blocks = target.reshape(batch, rows // COARSE, COARSE, columns // COARSE, COARSE)
-    blocks = blocks.permute(0, 1, 3, 2, 4).flatten(3)
-    known = torch.where(blocks > 0, blocks, torch.nan)
-    return known.nanmedian(dim=-1).values.nan_to_num(0.0)
-
-
-def _batch(
-    cache: FeatureCache, chosen: NDArray[np.int64], device: str
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return (
-        torch.from_numpy(cache.tokens[chosen]).to(device).float(),
-        torch.from_numpy(cache.class_tokens[chosen]).to(device).float(),
-        normalised(cache.image_rgb[chosen], device),
-        torch.from_numpy(cache.canonical_m[chosen]).to(device).float(),
-    )
-
-
-def _checkpoint_path(config: TrainConfig, member: int) -> Path:
-    output = Path(config.output)
-    return output.with_name(f"{output.name}.member{member}.checkpoint")

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Synthetic rooms for training, as unlike one another as can be while sizes stay true.
+
+The rooms of ``slamdepth synth`` taken apart: walls stretched and painted anew, furniture
+moved, turned, resized or left out; then workplaces with screens, keyboards, paper and
+crockery at their real sizes, since it is by known sizes that a network can tell metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from slamdepth.datasets import synth_furniture as furniture
+from slamdepth.datasets import synth_paint as paint
+from slamdepth.datasets import synth_print as printed
+from slamdepth.datasets import synth_scene
+from slamdepth.datasets.synth_shapes import Paint, Surface, box, cylinder, ellipsoid, lathe
+from slamdepth.geometry import so3_exp
+
+UP = np.array([0.0, 0.0, 1.0])
+_GROUPS = ("desk", "bookshelf", "sofa", "cabinet", "rug_and_table", "plant", "corners")
+_REPAINTED = 0.3  # share of a group's surfaces that get another material
+_DARK, _PALE = paint.plain((0.07, 0.07, 0.08), contrast=0.06), paint.plain((0.86, 0.85, 0.83))
+
+
+def varied_scene(seed: int) -> synth_scene.Scene:
+    """Room number ``seed``: its surfaces (z up, metres, corner at the origin) and lamps."""
+    rng = np.random.default_rng([seed, 13])
+    stretch = np.array([rng.uniform(0.6, 1.5), rng.uniform(0.7, 1.6), rng.uniform(0.9, 1.2)])
+    room = np.array(synth_scene.ROOM_M) * stretch
+    surfaces = [moved(s, np.diag(stretch), np.zeros(3)) for s in _shell(rng)]
+    for name in _GROUPS:
+        if rng.random() < 0.4:
+            continue
+        group = list(getattr(furniture, name)(rng))
+        if rng.random() < 0.6:
+            group = [replace(s, paint=_any_paint(rng)) if _may_change(s, rng) else s for s in group]
+        points = np.concatenate([s.points.reshape(-1, 3) for s in group])
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2 * [1, 1, 0]
+        A = so3_exp(UP * rng.uniform(-np.pi, np.pi)) * rng.uniform(0.9, 1.1)
+        place = np.append(rng.uniform(0.15, 0.85, 2) * room[:2], 0.0)
+        if rng.random() < 0.35:  # against its wall, where it belongs
+            A, place = np.eye(3), middle * stretch
+        surfaces += [moved(s, A, place - A @ middle) for s in group]
+    for _ in range(rng.integers(1, 4)):
+        place = np.append(rng.uniform(0.2, 0.8, 2) * room[:2], 0.0)
+        A = so3_exp(UP * rng.uniform(-np.pi, np.pi))
+        surfaces += [moved(s, A, place) for s in workplace(rng)]
+    for _ in range(rng.integers(0, 10)):
+        place = np.append(rng.uniform(0.08, 0.92, 2) * room[:2], 0.0)
+        surfaces += [moved(s, np.eye(3), place) for s in _block(rng, 0.3)]
+    return synth_scene.Scene(surfaces, _lamps(rng, seed, stretch))
+
+
+def moved(surface: Surface, A: np.ndarray, t: np.ndarray) -> Surface:
+    """``surface`` after the linear map ``A`` and the shift ``t``; its texture stretches along."""
+    return replace(surface, points=surface.points @ A.T + t)
+
+
+def workplace(rng: np.random.Generator) -> list[Surface]:
+    """A table about the origin with the things of an office or kitchen on it, and chairs."""
+    width, depth, height = rng.uniform(0.9, 2.0), rng.uniform(0.6, 1.0), rng.uniform(0.70, 0.78)
+    top = [paint.wood(_timber(rng)), paint.plain(_grey(rng, 0.6, 0.95)), paint.plain(_grey(rng))]
+    out = box(
+        (-width / 2, -depth / 2, height - 0.03), (width, depth, 0.03), top[rng.integers(3)], bottom=True
+    )
+    leg = paint.plain(_grey(rng))
+    for x in (-width / 2 + 0.03, width / 2 - 0.08):
+        for y in (-depth / 2 + 0.03, depth / 2 - 0.08):
+            out += box((x, y, 0.0), (0.05, 0.05, height - 0.03), leg)
+    for _ in range(rng.integers(3, 16)):
+        thing = _THINGS[rng.integers(len(_THINGS))](rng)
+        place = np.array([rng.uniform(-0.45, 0.45) * width, rng.uniform(-0.42, 0.42) * depth, height])
+        A = so3_exp(UP * rng.normal(0.0, 0.6)) * rng.uniform(0.92, 1.08)
+        out += [moved(s, A, place) for s in thing]
+    for _ in range(rng.integers(0, 3)):
+        place = np.array([rng.uniform(-0.5, 0.5) * width, rng.choice([-1, 1]) * rng.uniform(0.5, 1.0), 0.0])
+        A = so3_exp(UP * rng.uniform(-np.pi, np.pi))
+        out += [moved(s, A, place) for s in _chair(rng)]
+    return out
+
+
+def _shell(rng: np.random.Generator) -> list[Surface]:
+    """Walls, floor, ceiling, window, door and pictures; most of them painted as offices are."""
+    out = [*synth_scene._shell(rng)]
+    floors = [paint.wood(_timber(rng), plank_m=rng.uniform(0.06, 0.2)),
+              paint.fabric(_colour(rng, 0.1, 0.6)), paint.plain(_grey(rng), contrast=0.06),
+              paint.checker(_grey(rng), _grey(rng), float(rng.uniform(0.2, 0.5)))]  # fmt: skip
+    if rng.random() < 0.75:
+        out[0] = replace(out[0], paint=floors[rng.integers(len(floors))])
+    for k in range(2, 6):
+        if rng.random() < 0.75:
+            plain = paint.plain(_grey(rng, 0.55, 0.95), contrast=0.02)
+            wall = [plain, plain, paint.plaster(_colour(rng, 0.5, 0.95)), paint.wood(_timber(rng))]
+            out[k] = replace(out[k], paint=wall[rng.integers(len(wall))])
+    for group in (synth_scene._window(), synth_scene._door(), synth_scene._pictures(rng)):
+        if rng.random() < 0.75:
+            out += group
+    return out
+
+
+def _lamps(rng: np.random.Generator, seed: int, stretch: np.ndarray) -> list[synth_scene.Lamp]:
+    base = synth_scene.build_scene(seed, "rich").lamps
+    common = np.exp(rng.normal(0.1, 0.4))
+    return [
+        replace(
+            lamp,
+            centre=tuple(np.array(lamp.centre) * stretch * [1, 1, 0.98]),
+            power=tuple(
+                common * np.array(lamp.power) * np.exp(rng.normal(0, 0.4)) * np.exp(rng.normal(0, 0.1, 3))
+            ),
+        )
+        for lamp in base
+    ]
+
+
+def _may_change(surface: Surface, rng: np.random.Generator) -> bool:
+    return surface.emission == 0 and rng.random() < _REPAINTED
+
+
+def _colour(rng: np.random.Generator, low: float = 0.05, high: float = 0.95) -> paint.Colour:
+    """A colour of random hue and mostly low saturation."""
+    level = rng.uniform(low, high)
+    r, g, b = np.clip(level * np.exp(rng.normal(0, 0.18, 3)), 0.02, 0.97)
+    return (float(r), float(g), float(b))
+
+
+def _timber(rng: np.random.Generator) -> paint.Colour:
+    """A colour of wood, from ebony to birch."""
+    level = rng.uniform(0.18, 0.85)
+    r, g, b = level * np.array([1.0, rng.uniform(0.68, 0.85), rng.uniform(0.42, 0.68)])
+    return (float(r), float(g), float(b))
+
+
+def _grey(rng: np.random.Generator, low: float = 0.05, high: float = 0.95) -> paint.Colour:
+    r, g, b = np.clip(rng.uniform(low, high) * np.exp(rng.normal(0, 0.05, 3)), 0.02, 0.97)
+    return (float(r), float(g), float(b))
+
+
+def _any_paint(rng: np.random.Generator) -> Paint:
+    colour = _colour(rng)
+    paints = [paint.plain(colour), paint.plain(_grey(rng)), printed.book(colour), printed.cardboard(),
+              printed.poster(), paint.fabric(colour), paint.wood(_timber(rng)),
+              printed.page()]  # fmt: skip
+    return paints[rng.integers(len(paints))]
+
+
+def _block(rng: np.random.Generator, size_m: float) -> list[Surface]:
+    """A box, cylinder or ball of any material: sizes that say nothing, shapes that do."""
+    kind, chosen = rng.random(), _any_paint(rng)
+    sx, sy, sz = size_m * np.exp(rng.uniform(-0.9, 0.9, 3))
+    if kind < 0.5:
+        return box((-sx / 2, -sy / 2, 0.0), (sx, sy, sz), chosen, yaw=rng.uniform(0, np.pi))
+    if kind < 0.8:
+        return cylinder((0.0, 0.0, 0.0), 0.4 * sx, sz, chosen)
+    return [ellipsoid((0.0, 0.0, sz / 2), (sx / 2, sy / 2, sz / 2), chosen)]
+
+
+def _monitor(rng: np.random.Generator) -> list[Surface]:
+    w, h, foot = rng.uniform(0.40, 0.68), rng.uniform(0.28, 0.40), rng.uniform(0.06, 0.16)
+    case = _DARK if rng.random() < 0.75 else _PALE
+    out = box((-w / 2, -0.02, foot), (w, 0.04, h), case, bottom=True)
+    face = box((-w / 2 + 0.015, -0.022, foot + 0.015), (w - 0.03, 0.004, h - 0.03), printed.screen())
+    glow = rng.uniform(0.5, 1.3) if rng.random() < 0.5 else 0.0
+    out += [replace(s, emission=glow, paint=s.paint if glow else _DARK) for s in face]
+    return (
+        out
+        + box((-0.03, -0.02, 0.0), (0.06, 0.04, foot), case)
+        + box((-0.13, -0.1, 0.0), (0.26, 0.2, 0.012), case)
+    )
+
+
+def _keyboard(rng: np.random.Generator) -> list[Surface]:
+    return box((-0.22, -0.07, 0.0), (0.44, 0.14, 0.02), {"+z": printed.keyboard(), "*": _DARK})
+
+
+def _laptop(rng: np.random.Generator) -> list[Surface]:
+    case = paint.plain(_grey(rng, 0.05, 0.75))
+    out = box((-0.17, -0.12, 0.0), (0.34, 0.24, 0.02), {"+z": printed.keyboard(), "*": case})
+    lid = box((-0.17, 0.0, 0.0), (0.34, 0.01, 0.23), {"-y": printed.screen(), "*": case})
+    A = so3_exp(np.array([-rng.uniform(0.1, 0.5), 0.0, 0.0]))
+    return out + [moved(s, A, np.array([0.0, 0.12, 0.015])) for s in lid]
+
+
+def _paper(rng: np.random.Generator) -> list[Surface]:
+    out: list[Surface] = []
+    for k in range(rng.integers(1, 5)):
+        low = (-0.105 + rng.normal(0, 0.08), -0.15 + rng.normal(0, 0.08), 0.003 * k)
+        out += box(low, (0.21, 0.297, 0.003), {"+z": printed.page(), "*": _PALE}, yaw=rng.uniform(-1.5, 1.5))
+    return out
+
+
+def _books(rng: np.random.Generator) -> list[Surface]:
+    out, z = [], 0.0
+    for _ in range(rng.integers(1, 6)):
+        w, d, thick = rng.uniform(0.12, 0.22), rng.uniform(0.18, 0.30), rng.uniform(0.01, 0.05)
+        cover = {"+z": printed.poster(), "-y": printed.book(_colour(rng)), "*": _PALE}
+        out += box((-w / 2, -d / 2, z), (w, d, thick), cover, yaw=rng.uniform(-0.4, 0.4))
+        z += thick
+    return out
+
+
+def _binders(rng: np.random.Generator) -> list[Surface]:
+    out: list[Surface] = []
+    for k in range(rng.integers(1, 6)):
+        sides = {"-y": printed.book(_colour(rng)), "*": paint.plain(_colour(rng))}
+        out += box((0.08 * k, -0.14, 0.0), (0.075, 0.28, 0.32), sides)
+    return out
+
+
+def _mug(rng: np.random.Generator) -> list[Surface]:
+    return cylinder((0.0, 0.0, 0.0), rng.uniform(0.035, 0.045), rng.uniform(0.08, 0.11),
+                    paint.fabric(_colour(rng)), paint.plain((0.15, 0.1, 0.07)))  # fmt: skip
+
+
+def _bottle(rng: np.random.Generator) -> list[Surface]:
+    r, h = rng.uniform(0.03, 0.045), rng.uniform(0.18, 0.32)
+    profile = [(0.012, h), (0.013, 0.88 * h), (r, 0.68 * h), (r, 0.0)]
+    return [lathe((0.0, 0.0, 0.0), profile, paint.plain(_colour(rng)))]
+
+
+def _lamp(rng: np.random.Generator) -> list[Surface]:
+    metal, h = paint.plain(_colour(rng), contrast=0.06), rng.uniform(0.3, 0.5)
+    out = [*cylinder((0.0, 0.0, 0.0), 0.08, 0.02, metal), *cylinder((0.0, 0.0, 0.02), 0.01, h, metal)]
+    return [*out, lathe((0.0, 0.0, h - 0.06), [(0.03, 0.14), (0.11, 0.0)], metal)]
+
+
+def _fruit(rng: np.random.Generator) -> list[Surface]:
+    return [
+        ellipsoid(
+            (*rng.normal(0, 0.06, 2), 0.04), (0.04, 0.04, 0.04), paint.plain(_colour(rng), contrast=0.1)
+        )
+        for _ in range(rng.integers(1, 6))
+    ]
+
+
+def _small_block(rng: np.random.Generator) -> list[Surface]:
+    return _block(rng, 0.12)
+
+
+def _chair(rng: np.random.Generator) -> list[Surface]:
+    cloth = [paint.fabric(_colour(rng, 0.05, 0.5)), _DARK, paint.wood(_timber(rng))]
+    seat = cloth[rng.integers(len(cloth))]
+    out = [*box((-0.23, -0.22, 0.42), (0.46, 0.44, 0.07), seat, bottom=True)]
+    if rng.random() < 0.8:
+        h = rng.uniform(0.3, 0.6)
+        back = box((-0.22, 0.0, 0.0), (0.44, 0.06, h), seat, bottom=True)
+        A = so3_exp(np.array([-rng.uniform(0.0, 0.25), 0.0, 0.0]))
+        out += [moved(s, A, np.array([0.0, 0.2, 0.55])) for s in back]
+    if rng.random() < 0.6:
+        out += cylinder((0.0, 0.0, 0.06), 0.03, 0.36, _DARK)
+        for k in range(5):
+            spoke = box((0.0, -0.025, 0.03), (0.3, 0.05, 0.04), _DARK, bottom=True)
+            out += [moved(s, so3_exp(UP * (k * 2 * np.pi / 5)), np.zeros(3)) for s in spoke]
+    else:
+        for x in (-0.21, 0.17):
+            for y in (-0.2, 0.16):
+                out += box((x, y, 0.0), (0.04, 0.04, 0.42), seat)
+    return out
+
+
+_THINGS: tuple[Callable[[np.random.Generator], list[Surface]], ...] = (
+    _monitor, _monitor, _keyboard, _laptop, _paper, _paper, _books, _binders, _mug, _bottle, _lamp, _fruit,
+    _small_block, _small_block,
+)  # fmt: skip

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``slamdepth depth``: depth maps of an image, a folder or a video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from slamdepth.cli.console import QuietOption, VerboseOption, console
+from slamdepth.cli.options import (
+    CameraOption,
+    DepthOption,
+    DepthWeightsOption,
+    DeviceOption,
+    MaxFramesOption,
+    StrideOption,
+)
+from slamdepth.cli.progress import JobBar
+from slamdepth.cli.signals import stop_on_signals
+
+if TYPE_CHECKING:
+    from slamdepth.pipeline.depth_maps import DepthMapResult
+
+
+def depth_command(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="IMAGE|FOLDER|VIDEO",
+            help="An image, a folder of images, a video, or a TUM or 7-Scenes folder.",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for the results. Default: depth/<name>"),
+    ] = None,
+    depth: DepthOption = "dinov2",
+    depth_weights: DepthWeightsOption = None,
+    camera: CameraOption = None,
+    max_frames: MaxFramesOption = None,
+    stride: StrideOption = 1,
+    colour_range: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--range", metavar="NEAR FAR", help="Ends of the colours in metres. Default: found"),
+    ] = None,
+    no_cloud: Annotated[
+        bool, typer.Option("--no-cloud", help="Write no point clouds, the largest files.")
+    ] = False,
+    device: DeviceOption = "cpu",
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace earlier depth maps in the output folder.")
+    ] = False,
+    verbose: VerboseOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Write depth maps: colour, 16-bit millimetres, NumPy, point cloud; of a video also a film.
+
+    Example: slamdepth depth holiday.mp4 --stride 5 --output holiday-depth
+
+    Metres need the focal length: from --camera, a camera.yaml beside the images, a known sequence,
+    or EXIF. Else it is guessed, and the results say so.
+
+    Ctrl-C keeps what is done; the same command goes on from there.
+    """
+    from slamdepth.pipeline.depth_maps import DepthMapOptions, make_depth_maps
+
+    options = DepthMapOptions(
+        source=source,
+        output=output,
+        depth=depth,
+        weights=depth_weights,
+        camera_file=camera,
+        stride=stride,
+        max_frames=max_frames,
+        colour_range=colour_range,
+        cloud=not no_cloud,
+        device=device,
+        overwrite=overwrite,
+    )
+    with stop_on_signals() as stop, JobBar(quiet) as bar:
+        result = make_depth_maps(options, progress=bar.show, stop=stop)
+    _print_result(result, quiet)
+
+
+def _print_result(result: DepthMapResult, quiet: bool) -> None:
+    from slamdepth.pipeline.depth_maps.about import images
+    from slamdepth.report.console import two_columns
+
+    about = result.about
+    rows = [
+        ("images", str(about["frames"])),
+        ("unit", about["unit"]),
+        ("scale", about["scale"]),
+        *(("intrinsics", f"{group['how']} ({images(group['images'])})") for group in about["intrinsics"][:3]),
+        ("results", str(result.folder)),
+    ]
+    out = console()
+    out.print(two_columns(f"{about['source']['name']} · depth: {about['model']['name']}", rows))
+    if not quiet:
+        for note in about["notes"]:
+            out.print(f"note: {note}", style="yellow", markup=False)

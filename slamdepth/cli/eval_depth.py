@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``slamdepth eval-depth``: a depth model against sensor depth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
+from slamdepth.cli.options import CameraOption, DepthWeightsOption, DeviceOption
+
+if TYPE_CHECKING:
+    from slamdepth.depth.base import DepthModel
+    from slamdepth.depth.training.data import Place
+    from slamdepth.evaluation import DepthJudgement
+    from slamdepth.report.depth import SheetRow
+
+_SHEET_FRAMES = 4
+
+
+def eval_depth_command(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="Depth model to judge, by name.")],
+    data: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="DATA...",
+            help="Sequences with sensor depth, training pairs, Hypersim scenes, or folders of those.",
+        ),
+    ],
+    depth_weights: DepthWeightsOption = None,
+    camera: CameraOption = None,
+    stride: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="Judge every Nth frame. Default: 10, of training pairs 1"),
+    ] = None,
+    max_frames: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Judge no more than N frames of each DATA.")
+    ] = None,
+    device: DeviceOption = "cpu",
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Write all figures here, as JSON, and pictures beside it."
+        ),
+    ] = None,
+    verbose: VerboseOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Judge predicted depth against a depth sensor: as predicted, and scaled three ways.
+
+    Example: slamdepth eval-depth dinov2 rgbd_dataset_freiburg1_rpy --stride 20 --output rpy.json
+    """
+    show_log()
+    from slamdepth.depth.registry import create_depth_model
+    from slamdepth.errors import OutputError
+    from slamdepth.evaluation import Interval, mean_over_sets
+    from slamdepth.pipeline.depth_data import open_depth_data, thinned
+    from slamdepth.report.depth import judgement_lines, judgement_table
+
+    if output is not None and not output.parent.is_dir():
+        raise OutputError(f"{output.parent}: no such folder to write to; make it first")
+    places = [place for path in data for place in open_depth_data(path, camera=camera)]
+    network = create_depth_model(model, device=device, weights=depth_weights)
+    out = console()
+    judged: dict[str, DepthJudgement] = {}
+    sheets: dict[str, list[SheetRow]] = {}
+    for number, place in enumerate(places, 1):
+        name = place.name if place.name not in judged else f"{place.name}-{number}"
+        judged[name], sheets[name] = _judge(network, place, thinned(place, stride, max_frames), quiet)
+        title = f"{network.name} ({network.kind.value}) on {name}"
+        out.print(judgement_table(judged[name].ways, title))
+        for line in judgement_lines(judged[name]):
+            out.print(line, markup=False)
+    mean = mean_over_sets(list(judged.values()))
+    if len(judged) > 1:
+        shown = {way: {name: Interval(v) for name, v in figures.items()} for way, figures in mean.items()}
+        out.print(judgement_table(shown, f"mean over the {len(judged)} data sets, each counts the same"))
+    if output is not None:
+        settings = {"stride": stride, "max_frames": max_frames, "device": device}
+        pictures = _write(output, network, settings, judged, sheets, mean)
+        out.print(f"figures: {output}, pictures: {', '.join(pictures)}", markup=False)
+
+
+def _judge(
+    model: DepthModel, place: Place, indices: Sequence[int], quiet: bool
+) -> tuple[DepthJudgement, list[SheetRow]]:
+    """Judge one data set, and keep some of its frames for the sheet."""
+    import numpy as np
+    from rich.progress import track
+
+    from slamdepth.depth.evaluate import judge_depth
+    from slamdepth.pipeline.depth_data import readable
+    from slamdepth.report.depth import SheetRow
+    from slamdepth.types import DepthPrediction, Frame
+
+    spread = np.linspace(0, len(indices) - 1, _SHEET_FRAMES + 2).round().astype(int)[1:-1]
+    wanted = {indices[position] for position in spread.tolist()} if indices else set()
+    rows: list[SheetRow] = []
+
+    def watch(frame: Frame, prediction: DepthPrediction) -> None:
+        from slamdepth.evaluation.depth_fit import fitted_to_sensor
+
+        if frame.index in wanted and frame.depth_m is not None:
+            fitted = fitted_to_sensor(prediction.values, prediction.kind, frame.depth_m)
+            rows.append(SheetRow(frame.image_rgb, frame.depth_m, fitted))
+
+    err = error_console()
+    frames = track(
+        readable(place, indices), f"judging on {place.name}", total=len(indices), console=err, transient=True,
+        disable=quiet or not err.is_terminal,
+    )  # fmt: skip
+    return judge_depth(model, frames, watch=watch), rows
+
+
+def _write(
+    output: Path,
+    model: DepthModel,
+    settings: Mapping[str, object],
+    judged: dict[str, DepthJudgement],
+    sheets: dict[str, list[SheetRow]],
+    mean: dict[str, dict[str, float]],
+) -> list[str]:
+    """The JSON file and, beside it, a sheet a data set and one plot; names of the pictures."""
+    from dataclasses import asdict
+
+    from slamdepth.io import write_json
+    from slamdepth.report.depth import WAY_NAMES, write_over_depth, write_sheet
+    from slamdepth.report.environment import hardware, versions
+    from slamdepth.types import DepthKind
+
+    write_json(
+        output,
+        {
+            "depth_model": model.name,
+            "kind": model.kind,
+            "weights": [asdict(info) for info in model.weights],
+            "settings": settings,
+            "versions": versions(),
+            "hardware": hardware(),
+            "mean_over_sets": mean,
+            "data": {name: judgement.to_dict() for name, judgement in judged.items()},
+        },
+    )
+    scaled = WAY_NAMES["frame_median" if model.kind is DepthKind.METRIC else "frame_affine"]
+    pictures = [output.with_name(f"{output.stem}_over_depth.png")]
+    write_over_depth(pictures[0], judged, model.name)
+    for name, rows in sheets.items():
+        if rows:
+            pictures.append(output.with_name(f"{output.stem}_{name}.png"))
+            write_sheet(pictures[-1], rows, scaled, f"{model.name} on {name}")
+    return [picture.name for picture in pictures]

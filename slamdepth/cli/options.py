@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options that mean the same wherever a command has them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+DepthOption = Annotated[
+    str,
+    typer.Option("--depth", metavar="NAME", help="Depth model; an unknown name lists those there are."),
+]
+DepthWeightsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--depth-weights", metavar="FILE", help="Weights file of the depth model; for dinov2, of its head."
+    ),
+]
+CameraOption = Annotated[
+    Path | None,
+    typer.Option("--camera", metavar="FILE", help="camera.yaml with the intrinsics in pixels."),
+]
+StrideOption = Annotated[int, typer.Option("--stride", min=1, metavar="N", help="Take every Nth frame.")]
+MaxFramesOption = Annotated[
+    int | None, typer.Option("--max-frames", min=1, metavar="N", help="Take no more than N frames.")
+]
+DeviceOption = Annotated[str, typer.Option("--device", metavar="cpu|cuda", help="Where the network runs.")]

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The intrinsics of single images, and how sure they are: given, nominal or guessed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera
+from slamdepth.types import Camera
+
+GUESSED_VIEW_DEG = 60.0
+"""Field of view across the longer side where nothing is known: between a phone's main camera
+(65 to 70 degrees) and a depth camera's (57)."""
+
+_FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
+_EXIF_IFD, _FOCAL_LENGTH_35MM = 0x8769, 0xA405
+
+
+class Certainty(str, Enum):
+    """What a focal length rests on."""
+
+    GIVEN = "given"
+    NOMINAL = "nominal"
+    GUESSED = "guessed"
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A camera, and where it comes from.
+
+    Attributes:
+        camera: the intrinsics in pixels.
+        how: where they come from, for a reader.
+        certainty: GIVEN by a file or a known data set, NOMINAL from what the camera wrote
+            into the image, or GUESSED.
+    """
+
+    camera: Camera
+    how: str
+    certainty: Certainty
+
+
+def find_camera_file(folder: Path, camera_file: Path | None) -> tuple[Camera, str] | None:
+    """The camera in ``camera_file``, else in ``camera.yaml`` in ``folder``, and where it was; None
+    where neither is there.
+
+    Raises:
+        CameraError: the file cannot be read or is malformed.
+    """
+    if camera_file is not None:
+        return read_camera(camera_file.expanduser()), f"the file {camera_file.name}"
+    beside = folder / CAMERA_FILE
+    return (read_camera(beside), f"{CAMERA_FILE} beside the images") if beside.is_file() else None
+
+
+def intrinsics_of(width: int, height: int, focal_35mm: float | None = None) -> Intrinsics:
+    """Intrinsics of an image of ``width`` x ``height`` pixels without a camera file.
+
+    Args:
+        focal_35mm: the focal length in millimetres a lens with the same view would have on a
+            36 x 24 mm film, by the diagonal (CIPA DCG-001), from the image's EXIF.
+    """
+    centre = ((width - 1) / 2, (height - 1) / 2)
+    if focal_35mm is not None:
+        focal_px = focal_35mm * math.hypot(width, height) / _FULL_FRAME_DIAGONAL_MM
+        how = f"EXIF: as {focal_35mm:g} mm on 35 mm film, {focal_px:.1f} px; wrong if the image was cropped"
+        return Intrinsics(Camera(width, height, focal_px, focal_px, *centre), how, Certainty.NOMINAL)
+    focal_px = max(width, height) / (2.0 * math.tan(math.radians(GUESSED_VIEW_DEG) / 2.0))
+    how = f"a guess: {GUESSED_VIEW_DEG:g} degrees across the longer side, so {focal_px:.1f} px"
+    return Intrinsics(Camera(width, height, focal_px, focal_px, *centre), how, Certainty.GUESSED)
+
+
+def exif_focal_35mm(path: Path) -> float | None:
+    """``FocalLengthIn35mmFilm`` of an image file in millimetres; None where it has none."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            value = image.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_LENGTH_35MM)
+        focal_mm = float(value) if value is not None else 0.0
+    except Exception:  # damaged EXIF raises whatever its bytes lead to, and is as good as none
+        return None
+    return focal_mm if 0 < focal_mm < 10_000 else None

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Image files that are no sequence: one, or a folder of them."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+
+from slamdepth.datasets.intrinsics import Certainty, Intrinsics, exif_focal_35mm, intrinsics_of
+from slamdepth.datasets.sequence import check_size
+from slamdepth.errors import DatasetError
+from slamdepth.io import read_image_rgb
+from slamdepth.types import Camera, Frame
+
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The images in ``folder``, not in folders below, in the order of people: 2 before 10.
+
+    Raises:
+        DatasetError: the folder cannot be read or holds no image.
+    """
+    try:
+        files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS]
+        images = [path for path in files if path.is_file() and not path.name.startswith(".")]
+    except OSError as error:
+        raise DatasetError(f"{folder}: cannot be read: {error.strerror or error}") from error
+    if not images:
+        endings = ", ".join(ending.removeprefix(".") for ending in IMAGE_ENDINGS)
+        raise DatasetError(f"{folder}: no images in it ({endings}), and no known sequence layout")
+    return sorted(images, key=lambda path: (natural_key(path.name), path.name))
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sorts names so that numbers in them count as numbers and case does not count."""
+    parts = re.split(r"([0-9]+)", name.casefold())
+    return [(0, int(part), "") if part[:1].isdecimal() else (1, 0, part) for part in parts if part]
+
+
+def short_names(images: list[Path]) -> list[str]:
+    """A name for each image, no two alike on any file system: without its ending where that does."""
+    stems = Counter(path.stem.casefold() for path in images)
+    return [path.stem if stems[path.stem.casefold()] == 1 else path.name for path in images]
+
+
+def read_picture(path: Path, index: int, given: tuple[Camera, str] | None) -> tuple[Frame, Intrinsics]:
+    """Read an image as frame ``index``, with the ``given`` camera and its origin or what can be found.
+
+    Without a given camera the image is turned upright as its EXIF says.
+
+    Raises:
+        ImageDecodeError: the image does not decode.
+        CameraError: its size is not the given camera's.
+    """
+    image_rgb = read_image_rgb(path, upright=given is None)
+    height, width = image_rgb.shape[:2]
+    if given is not None:
+        camera, origin = given
+        check_size(path, image_rgb.shape, camera)
+        found = Intrinsics(camera, origin, Certainty.GIVEN)
+    else:
+        found = intrinsics_of(width, height, exif_focal_35mm(path))
+    return Frame(index, float(index), image_rgb, found.camera), found

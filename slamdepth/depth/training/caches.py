@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which features a training needs, and the folders they are cached in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from slamdepth.depth import weights as store
+from slamdepth.depth.dinov2 import DinoV2
+from slamdepth.depth.training.config import TrainConfig, ViewConfig, digest
+from slamdepth.depth.training.data import Place, PlaceReader, data_folder, open_place
+from slamdepth.depth.training.features import FeatureCache, build_cache
+from slamdepth.depth.training.progress import Progress, silent
+from slamdepth.depth.training.views import SampleKey, plan_plain, plan_samples
+from slamdepth.errors import ConfigError
+
+_JUDGED_VIEWS = 50
+_VIEW_VERSION = 3
+"""Counts up where the same settings make other views or features."""
+
+
+@dataclass(frozen=True)
+class PlannedCache:
+    """One cache before it is filled: a source's samples, or the plain views of a held-out place.
+
+    Attributes:
+        folder: where it is kept; its name hashes all that decides on its content.
+        keys: its samples, in order.
+        view: how they are made.
+        held_out: name of the place where it is for judging, else None.
+    """
+
+    folder: Path
+    places: tuple[Place, ...]
+    keys: tuple[SampleKey, ...]
+    view: ViewConfig
+    held_out: str | None = None
+
+
+def plan_caches(
+    config: TrainConfig, backbone_sha256: str, readers: Mapping[str, PlaceReader] | None = None
+) -> list[PlannedCache]:
+    """Open every place of ``config`` and say what is to be computed of it.
+
+    Args:
+        backbone_sha256: of the file whose features they are.
+        readers: readers beside those of :mod:`slamdepth.depth.training.readers`.
+
+    Raises:
+        ConfigError: a place is both trained on and held out, or none is trained on.
+        DatasetError: a place is missing or malformed.
+    """
+    roots = [data_folder(source.folder) for source in config.sources]
+    both = list(zip(roots, config.sources, strict=True))
+    trained = {(root / place.name).resolve() for root, source in both for place in source.places}
+    judged = {(root / name).resolve() for root, source in both for name in source.held_out}
+    if trained & judged:
+        raise ConfigError(f"setting 'sources': {min(trained & judged).name} is held out and also trained on")
+    if not trained:
+        raise ConfigError("setting 'sources': there is no place to train on")
+
+    def where(view: ViewConfig, places: tuple[Place, ...], *more: object) -> Path:
+        made_of = [place.fingerprint for place in places]
+        name = digest(view, _VIEW_VERSION, config.head.taps, config.seed, backbone_sha256, made_of, *more)
+        return store.cache_dir() / "features" / name
+
+    planned = []
+    for folder, source in both:
+        if not source.places:
+            continue
+        places = tuple(open_place(folder / place.name, source.reader, readers) for place in source.places)
+        keys = plan_samples(places, [place.samples for place in source.places], config.seed)[: source.limit]
+        view = config.view
+        if source.augment is not None:
+            view = view.model_copy(update={"augment": source.augment})
+        folder_of = where(view, places, source.places, source.limit)
+        planned.append(PlannedCache(folder_of, places, tuple(keys), view))
+    for folder, source in both:
+        for name in source.held_out:
+            place = open_place(folder / name, source.reader, readers)
+            keys = plan_plain(0, place, _JUDGED_VIEWS)
+            planned.append(
+                PlannedCache(where(config.view, (place,), "plain"), (place,), tuple(keys), config.view, name)
+            )
+    return planned
+
+
+def fill_cache(
+    planned: PlannedCache,
+    config: TrainConfig,
+    backbone: DinoV2,
+    *,
+    device: str = "cpu",
+    progress: Progress = silent,
+    stage: str = "features",
+) -> FeatureCache:
+    """Compute what is missing of ``planned``; errors of :func:`build_cache`."""
+    return build_cache(
+        planned.folder, planned.places, planned.keys, planned.view, backbone, config.head.taps, config.seed,
+        device=device, progress=progress, stage=stage,
+    )  # fmt: skip
+
+
+def benchmarks_seen(planned: list[PlannedCache]) -> dict[str, tuple[str, ...]]:
+    """The benchmarks a head trained on ``planned`` has seen, each with the places of it."""
+    seen: dict[str, tuple[str, ...]] = {}
+    for cache in planned:
+        for place in cache.places if cache.held_out is None else ():
+            if place.benchmark is not None:
+                seen[place.benchmark] = (*seen.get(place.benchmark, ()), place.name)
+    return seen

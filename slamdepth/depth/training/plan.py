@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a training would take, told before it is begun."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from slamdepth.depth import weights as store
+from slamdepth.depth.checkpoints import check_device
+from slamdepth.depth.dinov2 import DinoV2, load_dinov2
+from slamdepth.depth.head import DepthHead, HeadShape
+from slamdepth.depth.preprocess import PATCH
+from slamdepth.depth.training.caches import benchmarks_seen, plan_caches
+from slamdepth.depth.training.config import TrainConfig
+from slamdepth.depth.training.data import PlaceReader
+from slamdepth.depth.training.features import encode, sample_specs
+from slamdepth.depth.training.loop import steps_per_epoch
+from slamdepth.depth.training.losses import total_loss
+from slamdepth.depth.training.stages import predict
+from slamdepth.depth.training.store import bytes_per_sample, done_on_disk
+from slamdepth.errors import WeightsError
+
+
+@dataclass(frozen=True)
+class PlannedSource:
+    """One line of a plan.
+
+    Attributes:
+        places: names of its places.
+        images: images with depth in them.
+        samples, cached: views that are needed, and those of them on the disk already.
+        size_bytes: of all its views on the disk.
+    """
+
+    places: tuple[str, ...]
+    is_held_out: bool
+    images: int
+    samples: int
+    cached: int
+    size_bytes: int
+    folder: Path
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """What a training would take.
+
+    Attributes:
+        features_s, training_s: wall time, from a view and a step of each stage measured just
+            now; None where the backbone is missing.
+        missing: why it could not be measured.
+        benchmarks: benchmarks the head will have seen, each with the places of it.
+    """
+
+    sources: tuple[PlannedSource, ...]
+    steps: int
+    features_s: float | None
+    training_s: float | None
+    missing: str | None
+    benchmarks: dict[str, tuple[str, ...]]
+
+
+def plan_training(
+    config: TrainConfig,
+    *,
+    device: str = "cpu",
+    backbone: DinoV2 | None = None,
+    readers: Mapping[str, PlaceReader] | None = None,
+) -> TrainingPlan:
+    """Open the places of ``config``, count, and measure one batch of each kind; nothing is written.
+
+    Args:
+        backbone: use this instead of the weights ``config`` names (for tests).
+
+    Raises:
+        ConfigError, DatasetError: as :func:`~slamdepth.depth.training.caches.plan_caches`.
+    """
+    check_device(device)
+    backbone_sha256, missing = "given", None
+    if backbone is None:
+        try:
+            file = store.find_backbone(config.backbone)
+            backbone_sha256 = store.verify(file)
+            backbone = load_dinov2(file, device)
+        except WeightsError as error:
+            missing = str(error)
+    planned = plan_caches(config, backbone_sha256, readers)
+    dim, patch = (backbone.dim, backbone.patch) if backbone else (HeadShape().token_dim, PATCH)
+    specs = sample_specs(config.view, config.head.taps, dim, patch)
+    sources = tuple(
+        PlannedSource(
+            tuple(place.name for place in plan.places),
+            plan.held_out is not None,
+            sum(map(len, plan.places)),
+            len(plan.keys),
+            done_on_disk(plan.folder, len(plan.keys), specs),
+            len(plan.keys) * bytes_per_sample(specs),
+            plan.folder,
+        )
+        for plan in planned
+    )
+    samples = sum(source.samples for source in sources if not source.is_held_out)
+    steps = steps_per_epoch(config, samples)
+    features_s = training_s = None
+    if backbone is not None:
+        todo = sum(source.samples - source.cached for source in sources)
+        features_s = todo * _view_s(config, backbone, device) if todo else 0.0
+        coarse_s, fine_s = _step_s(config, dim, patch, device)
+        epoch_s = config.coarse_epochs * coarse_s + config.fine_epochs * fine_s
+        training_s = config.members * steps * epoch_s
+    epochs = config.coarse_epochs + config.fine_epochs
+    return TrainingPlan(
+        sources, config.members * epochs * steps, features_s, training_s, missing, benchmarks_seen(planned)
+    )
+
+
+def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:
+    images = [np.zeros((config.view.rows, config.view.columns, 3), np.uint8)] * 4
+    return _second_time(lambda: encode(images, backbone, config.head.taps, device)) / len(images)
+
+
+def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[float, float]:
+    view, taps = config.view, config.head.taps
+    shape = HeadShape(taps, dim, config.head.dim, config.head.blocks, config.head.guide_dim)
+    head = DepthHead(shape, config.head.dropout).to(device).train()
+    batch = (
+        torch.zeros(config.batch, len(taps), dim, view.rows // patch, view.columns // patch, device=device),
+        torch.zeros(config.batch, len(taps), dim, device=device),
+        torch.zeros(config.batch, 3, view.rows, view.columns, device=device),
+        torch.ones(config.batch, view.rows, view.columns, device=device),
+    )
+
+    def step(is_fine: bool) -> None:
+        loss = total_loss(*predict(head, batch, is_fine), config.loss)
+        loss.backward()
+        float(loss.detach())  # waits for a GPU
+
+    return _second_time(lambda: step(False)), _second_time(lambda: step(True))
+
+
+def _second_time(work: Callable[[], object]) -> float:
+    """Seconds of the second call: the first one pays for memory and plans."""
+    work()
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which view of which pair a sample is, and making it; the same for the same seed."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
+from slamdepth.depth.training.augment import View, augmented_view, mixed_view, plain_view
+from slamdepth.depth.training.config import ViewConfig
+from slamdepth.depth.training.data import Place
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class SampleKey:
+    """Which view of which pair a sample is; copy -1 is the plain, unaugmented view."""
+
+    place: int
+    frame: int
+    copy: int
+
+
+def plan_samples(places: Sequence[Place], samples: Sequence[int], seed: int) -> list[SampleKey]:
+    """Which views to make: each place's number spread over its frames, in random order.
+
+    A place with more frames than samples is thinned evenly; one with fewer is shown
+    several times, each copy augmented anew.
+    """
+    keys = []
+    for index, (place, count) in enumerate(zip(places, samples, strict=True)):
+        frames = len(place)
+        if count < frames:
+            chosen = np.linspace(0, frames - 1, count).round().astype(int)
+            keys += [SampleKey(index, int(frame), 0) for frame in chosen]
+        else:
+            keys += [SampleKey(index, k % frames, k // frames) for k in range(count)]
+    order = np.random.default_rng(seed).permutation(len(keys))
+    return [keys[k] for k in order]
+
+
+def plan_plain(place_index: int, place: Place, limit: int) -> list[SampleKey]:
+    """At most ``limit`` unaugmented views of one place, spread over it; for judging."""
+    count = min(limit, len(place))
+    chosen = np.linspace(0, len(place) - 1, count).round().astype(int)
+    return [SampleKey(place_index, int(frame), -1) for frame in chosen]
+
+
+def make_view(places: Sequence[Place], key: SampleKey, config: ViewConfig, seed: int) -> View:
+    """The view ``key`` names; the same for the same seed whatever else is made.
+
+    Views mixed into it are of any of ``places``, every pair as likely.
+    """
+    place = places[key.place]
+    if key.copy < 0:
+        return plain_view(place.read(key.frame), config.rows, config.columns)
+    rng = np.random.default_rng([seed, zlib.crc32(place.name.encode()), key.frame, key.copy])
+    ends = np.cumsum([len(other) for other in places])
+
+    def another() -> View:
+        k = int(rng.integers(ends[-1]))
+        index = int(np.searchsorted(ends, k, side="right"))
+        frame = places[index].read(k - int(ends[index]) + len(places[index]))
+        return augmented_view(frame, config.rows, config.columns, config.augment, rng)
+
+    view = augmented_view(place.read(key.frame), config.rows, config.columns, config.augment, rng)
+    if rng.random() < config.augment.mixed:
+        view = mixed_view(view, another())
+        if rng.random() < config.augment.mixed_again:
+            view = mixed_view(view, another())
+    return view
+
+
+def canonical_depth(view: View, config: ViewConfig) -> NDArray[np.float32]:
+    """``(rows, columns)`` depth at the canonical focal length; 0 where unknown or out of range."""
+    known = (view.depth_m >= config.min_depth_m) & (view.depth_m <= config.max_depth_m)
+    factor = np.float32(view.focal_px / CANONICAL_FOCAL_PX)
+    return np.where(known, view.depth_m / factor, 0.0).astype(np.float32)

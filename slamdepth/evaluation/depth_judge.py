@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything that is said of predicted depth beside a sensor's: scaled four ways, with intervals."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+
+from slamdepth.evaluation.bootstrap import Interval, interval, spread
+from slamdepth.evaluation.depth import depth_errors
+from slamdepth.evaluation.depth_fit import affine_fit, apply_affine, as_depth, fits_in
+from slamdepth.evaluation.depth_maps import EdgeScore, depth_ssim, edge_score
+from slamdepth.types import DepthKind, DepthPrediction
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+WAYS = ("as_predicted", "sequence_median", "frame_median", "frame_affine")
+FIGURES = (
+    "abs_rel", "rmse_m", "log_rmse", "delta1", "delta2", "delta3", "ssim", "edge_f1", "edge_error_px",
+)  # fmt: skip
+BINS = 24
+_IN_MEMORY_BYTES = 2**28
+_NO_EDGES = EdgeScore(math.nan, math.nan)
+
+
+@dataclass(frozen=True)
+class OverDepth:
+    """Errors by the sensor's depth; over all pixels of all frames.
+
+    Attributes:
+        edges_m: ``BINS + 1`` bounds of the bins, evenly spaced in log depth.
+        pixels: pixels in each bin.
+        abs_rel: way of scaling to the mean AbsRel in each bin, None where it is empty.
+        log_bias: the same of the mean natural logarithm of predicted / sensor.
+    """
+
+    edges_m: tuple[float, ...]
+    pixels: tuple[int, ...]
+    abs_rel: dict[str, tuple[float | None, ...]]
+    log_bias: dict[str, tuple[float | None, ...]]
+
+
+@dataclass(frozen=True)
+class DepthJudgement:
+    """What predicted depth is worth. Figures are means over frames, with 95 % intervals.
+
+    Attributes:
+        kind: what the model's numbers mean.
+        ways: way of scaling, of :data:`WAYS`, to figure, of :data:`FIGURES`, to its value.
+            Without ``as_predicted`` where the numbers are no metres. ``abs_rel``, ``rmse_m``
+            (metres), ``log_rmse``, ``delta1`` to ``delta3``: see
+            :class:`~slamdepth.evaluation.depth.DepthErrors`; ``ssim``, ``edge_f1``,
+            ``edge_error_px``: see :mod:`slamdepth.evaluation.depth_maps`.
+        fitted_in: what ``frame_affine`` is linear in.
+        sequence_factor: the one factor of ``sequence_median``: median of sensor / predicted.
+        scale_spread: standard deviation over the frames of the log of the frame's factor.
+        surest_half: AbsRel of each frame's surest half of pixels over that of all of them,
+            after a median a frame; 1 = says nothing. None where the model gives no sigma.
+        within_one_sigma: share of pixels whose log error, as predicted, is below sigma; 0.68
+            where sigma is calibrated. None without sigma or metres.
+        over_depth: errors by depth.
+        frames: number compared. pixels: of the errors, after subsampling.
+        coverage: share of the sensor's pixels that have a prediction.
+        per_frame: figure, as ``way.figure``, ``log_factor`` (of ``frame_median``) or by its name
+            above, to its ``frames`` values.
+    """
+
+    kind: DepthKind
+    ways: dict[str, dict[str, Interval]]
+    fitted_in: str
+    sequence_factor: float
+    scale_spread: Interval
+    surest_half: Interval | None
+    within_one_sigma: Interval | None
+    over_depth: OverDepth
+    frames: int
+    pixels: int
+    coverage: float
+    per_frame: dict[str, tuple[float, ...]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures as nested plain values; NaN where a frame lacks a figure."""
+        return {**asdict(self), "kind": self.kind.value}
+
+
+def mean_over_sets(judgements: Sequence[DepthJudgement]) -> dict[str, dict[str, float]]:
+    """Means of :attr:`DepthJudgement.ways` over data sets, each of which counts the same; NaN
+    where a set lacks the figure."""
+    return {
+        way: {name: float(np.mean([j.ways[way][name].value for j in judgements])) for name in FIGURES}
+        for way in WAYS
+        if all(way in j.ways for j in judgements)
+    }
+
+
+class DepthJudge:
+    """Collects predictions and judges them at the end.
+
+    The factor of ``sequence_median`` is known only at the end, so maps wait in a temporary
+    file, in memory up to 256 MiB; everything else is small.
+
+    Args:
+        kind: what the predictions' numbers mean.
+        min_m, max_m: sensor depths outside are not compared.
+        stride: errors are of every ``stride``-th pixel of every ``stride``-th row; SSIM and
+            edges are of all.
+    """
+
+    def __init__(self, kind: DepthKind, *, min_m: float = 0.1, max_m: float = 10.0, stride: int = 4) -> None:
+        if not 0 < min_m < max_m or stride < 1:
+            raise ValueError(f"need 0 < min_m < max_m and stride > 0, got {min_m}, {max_m}, {stride}")
+        self.kind, self.min_m, self.max_m = kind, min_m, max_m
+        self._grid = (slice(stride // 2, None, stride),) * 2
+        self._waiting: IO[bytes] = tempfile.SpooledTemporaryFile(max_size=_IN_MEMORY_BYTES)  # noqa: SIM115
+        self._ratios: list[NDArray[np.float32]] = []
+        self._scores: list[dict[str, float]] = []
+        self._sensor_pixels = 0
+
+    @property
+    def frames(self) -> int:
+        """Frames compared so far."""
+        return len(self._ratios)
+
+    def add(self, prediction: DepthPrediction, sensor_m: NDArray[np.floating]) -> bool:
+        """Take in one frame.
+
+        Args:
+            prediction: its values, 0, negative or not finite where there is none.
+            sensor_m: ``(H, W)`` metres of the same pixels; 0 where unknown.
+
+        Returns:
+            False where no pixel has both; such a frame is not counted.
+
+        Raises:
+            ValueError: the maps are not of one shape, or the prediction is of another kind.
+        """
+        if prediction.kind is not self.kind:
+            raise ValueError(f"a judge of {self.kind.value} was given {prediction.kind.value}")
+        if sensor_m.ndim != 2 or prediction.values.shape != sensor_m.shape:
+            raise ValueError(
+                f"depth of shapes {prediction.values.shape} and {sensor_m.shape}; need one (H, W)"
+            )
+        depth = as_depth(prediction.values, self.kind)
+        sensor = np.where((sensor_m >= self.min_m) & (sensor_m <= self.max_m), sensor_m, 0.0)
+        d, s = depth[self._grid].ravel(), sensor[self._grid].ravel()
+        both = (d > 0) & (s > 0)
+        self._sensor_pixels += int((s > 0).sum())
+        if not both.any():
+            return False
+        d, s = d[both], s[both]
+        self._ratios.append((s / d).astype(np.float32))
+        sigma = None if prediction.sigma_log is None else prediction.sigma_log[self._grid].ravel()[both]
+        self._scores.append({
+            "log_factor": float(np.log(np.median(s / d))),
+            **_uncertainty(d, s, sigma, self.kind is DepthKind.METRIC),
+        })  # fmt: skip
+        for array in (depth.astype(np.float32), sensor.astype(np.float32)):
+            np.save(self._waiting, array)
+        return True
+
+    def judge(self) -> DepthJudgement | None:
+        """The figures over all frames added, or None where none could be compared."""
+        if not self._ratios:
+            return None
+        factor = float(np.median(np.concatenate(self._ratios)))
+        ways = WAYS if self.kind is DepthKind.METRIC else WAYS[1:]
+        rows: list[dict[str, float]] = []
+        bins = _Bins(self.min_m, self.max_m, ways)
+        self._waiting.seek(0)
+        for score in self._scores:
+            depth, sensor = (np.load(self._waiting).astype(np.float64) for _ in range(2))
+            row = dict(score)
+            edges: EdgeScore | None = None
+            for way, scaled in self._scaled(depth, sensor, factor, score["log_factor"]):
+                if edges is None or way == "frame_affine":  # a factor alone moves no edge
+                    edges = edge_score(scaled, sensor, (scaled > 0) & (sensor > 0)) or _NO_EDGES
+                figures = self._figures(scaled, sensor, edges)
+                row.update({f"{way}.{name}": value for name, value in figures.items()})
+                bins.add(way, scaled[self._grid], sensor[self._grid])
+            rows.append(row)
+        columns = {name: np.array([row.get(name, math.nan) for row in rows]) for name in _names(rows)}
+        return DepthJudgement(
+            kind=self.kind,
+            ways={way: {f: interval(columns[f"{way}.{f}"]) for f in FIGURES} for way in ways},
+            fitted_in=fits_in(self.kind),
+            sequence_factor=factor,
+            scale_spread=interval(columns["log_factor"], spread),
+            surest_half=_optional(columns, "surest_half"),
+            within_one_sigma=_optional(columns, "within_one_sigma"),
+            over_depth=bins.result(),
+            frames=self.frames,
+            pixels=sum(len(ratio) for ratio in self._ratios),
+            coverage=sum(len(ratio) for ratio in self._ratios) / self._sensor_pixels,
+            per_frame={name: tuple(column.tolist()) for name, column in columns.items()},
+        )
+
+    def _scaled(
+        self, depth: Floats, sensor: Floats, factor: float, log_factor: float
+    ) -> list[tuple[str, Floats]]:
+        d, s = depth[self._grid], sensor[self._grid]
+        both = (d > 0) & (s > 0)
+        fit = affine_fit(d[both], s[both], self.kind)
+        scaled = [
+            ("sequence_median", depth * factor),
+            ("frame_median", depth * math.exp(log_factor)),
+            ("frame_affine", apply_affine(depth, fit, self.kind, self.min_m, self.max_m)),
+        ]
+        return [("as_predicted", depth), *scaled] if self.kind is DepthKind.METRIC else scaled
+
+    def _figures(self, depth_m: Floats, sensor_m: Floats, edges: EdgeScore) -> dict[str, float]:
+        known = (depth_m > 0) & (sensor_m > 0)
+        chosen = known[self._grid]
+        errors = depth_errors(depth_m[self._grid][chosen], sensor_m[self._grid][chosen])
+        return {
+            **asdict(errors),
+            "ssim": depth_ssim(depth_m, sensor_m, known),
+            "edge_f1": edges.f1,
+            "edge_error_px": edges.error_px,
+        }
+
+
+class _Bins:
+    """Sums of errors by the sensor's depth."""
+
+    def __init__(self, min_m: float, max_m: float, ways: tuple[str, ...]) -> None:
+        self.edges = np.geomspace(min_m, max_m, BINS + 1)
+        self.sums = {way: np.zeros((3, BINS)) for way in ways}
+
+    def add(self, way: str, depth_m: Floats, sensor_m: Floats) -> None:
+        both = (depth_m > 0) & (sensor_m > 0)
+        d, s = depth_m[both], sensor_m[both]
+        which = np.clip(np.searchsorted(self.edges, s, side="right") - 1, 0, BINS - 1)
+        for row, values in enumerate((np.ones_like(d), np.abs(d - s) / s, np.log(d / s))):
+            self.sums[way][row] += np.bincount(which, values, BINS)
+
+    def result(self) -> OverDepth:
+        counts = next(iter(self.sums.values()))[0]
+        means = {
+            way: [[float(v / n) if n else None for v, n in zip(row, counts, strict=True)] for row in sums[1:]]
+            for way, sums in self.sums.items()
+        }
+        return OverDepth(
+            edges_m=tuple(self.edges.tolist()),
+            pixels=tuple(int(n) for n in counts),
+            abs_rel={way: tuple(rows[0]) for way, rows in means.items()},
+            log_bias={way: tuple(rows[1]) for way, rows in means.items()},
+        )
+
+
+def _uncertainty(
+    depth: Floats, sensor_m: Floats, sigma: NDArray[np.floating] | None, is_metric: bool
+) -> dict[str, float]:
+    if sigma is None or len(depth) < 2:
+        return {}
+    error = np.log(depth / sensor_m)
+    scaled = np.abs(np.expm1(error - np.median(error)))
+    sure = sigma <= np.median(sigma)
+    found = {"surest_half": float(scaled[sure].mean() / max(float(scaled.mean()), 1e-9))}
+    return {**found, "within_one_sigma": float(np.mean(np.abs(error) < sigma))} if is_metric else found
+
+
+def _names(rows: list[dict[str, float]]) -> list[str]:
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def _optional(columns: dict[str, Floats], name: str) -> Interval | None:
+    return interval(columns[name]) if name in columns else None

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images with sensor depth to judge by or to count, however they are stored."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from slamdepth.datasets import open_dataset
+from slamdepth.depth.training.data import Place, data_folder, known_readers, open_place
+from slamdepth.errors import DatasetError
+from slamdepth.pipeline.training_data import SequencePlace
+from slamdepth.types import Frame
+
+logger = logging.getLogger(__name__)
+
+_SEQUENCE_STRIDE = 10
+
+
+def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
+    """What a folder holds: training pairs (``camera.json``) or a Hypersim scene, several of
+    those, each in a folder of its own, or a sequence of a known layout.
+
+    Args:
+        path: absolute, relative to the current folder, or below ``$SLAMDEPTH_DATA``.
+        camera: a ``camera.yaml`` for a sequence.
+
+    Raises:
+        DatasetError: the folder is missing, of no known kind, malformed, or has no depth.
+        CameraError: the intrinsics of a sequence are unknown or malformed.
+    """
+    folder = data_folder(str(path))
+    readers = known_readers().values()
+
+    def is_place(candidate: Path) -> bool:
+        return any(reader.matches(candidate) for reader in readers)
+
+    inside = (below for below in sorted(folder.glob("*")) if below.is_dir() and is_place(below))
+    places = [folder] if is_place(folder) else list(inside)
+    if places and camera is not None:
+        raise DatasetError(f"{places[0]}: its camera is known with it; leave out --camera")
+    if places:
+        return [open_place(place) for place in places]
+    return [SequencePlace.of(open_dataset(folder, camera))]
+
+
+def thinned(place: Place, stride: int | None = None, max_frames: int | None = None) -> list[int]:
+    """Which images of ``place`` to look at.
+
+    Args:
+        stride: every so-manieth image, of a sequence counted with those that lack depth;
+            None: 10 of a sequence, 1 of others, which are thinned already.
+        max_frames: no more than so many, the first ones.
+    """
+    numbers: Iterable[int] = range(len(place))
+    if isinstance(place, SequencePlace):
+        stride, numbers = stride or _SEQUENCE_STRIDE, place.frames
+    return [index for index, number in enumerate(numbers) if number % (stride or 1) == 0][:max_frames]
+
+
+def readable(place: Place, indices: Iterable[int]) -> Iterator[Frame]:
+    """The frames in order; one that cannot be read is left out with a warning."""
+    for index in indices:
+        try:
+            yield place.read(index)
+        except DatasetError as error:
+            logger.warning("frame left out: %s", error)

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writing a film frame by frame, whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slamdepth.errors import OutputError
+from slamdepth.io import replacing
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+CODECS = ("vp09", "mp4v")
+"""VP9 first: browsers and players know it, and OpenCV's own FFmpeg brings it along; H.264 it
+cannot write."""
+
+
+@contextmanager
+def film_writer(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+    """A function that adds a frame ``(H, W, 3)`` RGB, of one even size throughout, to an mp4 file.
+
+    The file is moved to ``path`` when the block succeeds.
+
+    Raises:
+        OutputError: no codec is there, or ``path`` cannot be written.
+    """
+    import cv2
+
+    writer: Any = None
+    with replacing(path) as temporary:
+
+        def add(frame_rgb: NDArray[np.uint8]) -> None:
+            nonlocal writer
+            if writer is None:
+                writer = _open(temporary, path, fps, frame_rgb.shape[1], frame_rgb.shape[0])
+            writer.write(cv2.cvtColor(frame_rgb, cv2.COLOR_RGB2BGR))
+
+        try:
+            yield add
+        finally:
+            if writer is not None:
+                writer.release()
+        if not temporary.is_file() or temporary.stat().st_size == 0:
+            raise OutputError(f"{path}: the film could not be written")
+
+
+def _open(temporary: Path, path: Path, fps: float, width: int, height: int) -> Any:
+    import cv2
+
+    for codec in CODECS:
+        writer = cv2.VideoWriter(
+            str(temporary), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, (width, height)
+        )
+        if writer.isOpened():
+            return writer
+    raise OutputError(f"{path}: this OpenCV can write neither VP9 nor MPEG-4 video")

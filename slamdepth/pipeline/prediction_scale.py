@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chosen before tracking: what predictions are multiplied (and shifted) by as they come.
+
+A number, a file of ``slamdepth scale``, or what this sequence's own sensor says.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from slamdepth.config import GROUND_TRUTH, Config
+from slamdepth.datasets import Dataset
+from slamdepth.depth.base import DepthModel
+from slamdepth.depth.scale import DepthScale, ScaleDomain, ScaleFit, fit_scale, needs_shift
+from slamdepth.depth.scale_file import check_same_model, read_scale
+from slamdepth.depth.scaled import ScaledDepth
+from slamdepth.errors import ConfigError, DatasetError, ImageDecodeError
+from slamdepth.pipeline.options import RunInterrupted
+from slamdepth.report import ScaleSource
+from slamdepth.types import Frame
+
+logger = logging.getLogger(__name__)
+
+NETWORK_SIGMA_LOG = 0.2
+"""Assumed deviation of a network's scale that all frames of a place share: the shipped head was off
+by 0.10 to 0.17 on three real sequences it had not seen (README), by more on some places held out."""
+
+SENSOR_SIGMA_LOG = 0.03
+"""Of a Kinect's depth: the factors in use for one camera of TUM RGB-D differ by 4 %."""
+
+_FIT_FRAMES = 60
+
+
+@dataclass(frozen=True)
+class PredictionScale:
+    """What was decided before tracking.
+
+    Attributes:
+        source: NETWORK or SENSOR where predictions stay as they are.
+        scale: what predictions are made metric by, or None.
+        sigma_log: deviation of the log of the resulting scale, known or assumed.
+        sigma_is_known: False where ``sigma_log`` is an assumption.
+        how: a phrase.
+        from_ground_truth: the scale comes from this sequence's own sensor.
+        fit: where this run fitted it.
+        wants_trajectory: the scale is to be taken from the ground truth's trajectory afterwards.
+    """
+
+    source: ScaleSource
+    how: str
+    sigma_log: float
+    sigma_is_known: bool = False
+    scale: DepthScale | None = None
+    from_ground_truth: bool = False
+    fit: ScaleFit | None = None
+    wants_trajectory: bool = False
+
+    def applied_to(self, model: DepthModel) -> DepthModel:
+        """``model``, its predictions scaled where that was decided.
+
+        Raises:
+            ConfigError: this scale cannot make this model metric.
+        """
+        return model if self.scale is None else ScaledDepth(model, self.scale)
+
+
+def check_scale_options(dataset: Dataset, config: Config, indices: Sequence[int]) -> None:
+    """Refuse what cannot be right, before anything is computed.
+
+    Raises:
+        ConfigError: a scale for sensor depth, or times of a baseline outside the frames.
+        DatasetError: there is no ground truth to take a scale from.
+    """
+    scale = config.scale
+    if scale.depth is not None and config.depth.name == "sensor":
+        raise ConfigError("--depth sensor is in metres already; --depth-scale is for predicted depth")
+    if scale.depth == GROUND_TRUTH and not dataset.has_depth and dataset.ground_truth is None:
+        raise DatasetError(
+            f"{dataset.path}: has neither depth images nor a ground truth trajectory to take the scale from"
+        )
+    if scale.baseline_between_s is not None and len(indices):
+        first_s, last_s = (float(dataset.timestamps_s[i]) for i in (indices[0], indices[-1]))
+        for time_s in scale.baseline_between_s:
+            if not first_s <= time_s <= last_s:
+                raise ConfigError(
+                    f"--baseline-between {time_s:.3f}: the frames run from {first_s:.3f} to {last_s:.3f} s"
+                )
+
+
+def choose_prediction_scale(
+    dataset: Dataset,
+    model: DepthModel,
+    config: Config,
+    indices: Sequence[int],
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    stop: threading.Event | None = None,
+) -> PredictionScale:
+    """Decide what predictions are multiplied by, and fit it where that is asked for.
+
+    Args:
+        model: as it came, not scaled.
+        indices: frames of the run; a fit takes some of them.
+
+    Raises:
+        ConfigError: the file or number cannot scale this model.
+        DatasetError: no scale can be fitted.
+        RunInterrupted: ``stop`` was set meanwhile.
+    """
+    asked = config.scale.depth
+    name = model.name
+    if asked is None:
+        if name == "sensor":
+            return PredictionScale(ScaleSource.SENSOR, "measured by the depth sensor", SENSOR_SIGMA_LOG)
+        return PredictionScale(ScaleSource.NETWORK, f"depth predicted by {name}", NETWORK_SIGMA_LOG)
+    if asked == GROUND_TRUTH:
+        if not dataset.has_depth:
+            how = f"depth predicted by {name}"
+            return PredictionScale(ScaleSource.NETWORK, how, NETWORK_SIGMA_LOG, wants_trajectory=True)
+        chosen = indices[:: -(-len(indices) // _FIT_FRAMES)]
+        frames = read_with_depth(dataset, chosen, progress, stop)
+        fit = fit_scale(model, frames, with_shift=needs_shift(model.kind), sequence=dataset.name)
+        how = (
+            f"{_formula(name, fit.scale)}, fitted to {fit.frames} frames of this sequence's own depth sensor"
+        )
+        return _of_fit(ScaleSource.GROUND_TRUTH_DEPTH, fit, how, own=True)
+    if isinstance(asked, float | int):
+        scale = DepthScale(float(asked), 0.0, ScaleDomain.of(model.kind))
+        how = f"{_formula(name, scale)}, a number given by the user"
+        return PredictionScale(ScaleSource.VALUE, how, NETWORK_SIGMA_LOG, scale=scale)
+    fit = read_scale(asked)
+    check_same_model(fit, model, asked)
+    is_own = fit.sequence == dataset.name
+    of = "this very sequence" if is_own else f"{fit.sequence}, another sequence"
+    how = f"{_formula(name, fit.scale)}, from {Path(asked).name}, fitted to the depth sensor of {of}"
+    return _of_fit(ScaleSource.FILE, fit, how, own=is_own)
+
+
+def _of_fit(source: ScaleSource, fit: ScaleFit, how: str, *, own: bool) -> PredictionScale:
+    is_known = own and fit.scale_sigma_log is not None
+    sigma_log = fit.scale_sigma_log if own and fit.scale_sigma_log is not None else NETWORK_SIGMA_LOG
+    return PredictionScale(
+        source, how, sigma_log, is_known, fit.scale, own, None if source is ScaleSource.FILE else fit
+    )
+
+
+def _formula(name: str, scale: DepthScale) -> str:
+    shift = f" {scale.shift:+.3g} {scale.domain.shift_unit}" if scale.shift else ""
+    domain = f" as {scale.domain.value}" if shift else ""
+    return f"depth predicted by {name} times {scale.scale:.4g}{shift}{domain}"
+
+
+def read_with_depth(
+    dataset: Dataset,
+    indices: Sequence[int],
+    progress: Callable[[int, int], None],
+    stop: threading.Event | None = None,
+) -> Iterator[Frame]:
+    """Frames with their sensor depth; what does not decode is left out with a warning.
+
+    Raises:
+        RunInterrupted: ``stop`` was set.
+    """
+    for done, index in enumerate(indices):
+        progress(done, len(indices))
+        if stop is not None and stop.is_set():
+            raise RunInterrupted("interrupted while the scale was fitted; nothing was saved")
+        try:
+            yield dataset.read(index, with_depth=True)
+        except ImageDecodeError as error:
+            logger.warning("left out of the fit of the scale: %s", error)

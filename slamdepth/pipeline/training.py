@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From settings to a depth head and a folder that explains it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from slamdepth.depth.training.config import TrainConfig
+from slamdepth.depth.training.progress import Progress, silent
+from slamdepth.pipeline.training_data import sequence_readers
+
+if TYPE_CHECKING:
+    from slamdepth.depth.dinov2 import DinoV2
+    from slamdepth.depth.training.plan import TrainingPlan
+    from slamdepth.depth.training.results import TrainResult
+    from slamdepth.depth.training.search import SearchResult
+
+
+def report_folder(output: Path) -> Path:
+    """Where the pictures and figures of the head ``output`` go."""
+    return output.with_name(f"{output.stem}_training")
+
+
+def run_training(
+    config: TrainConfig, *, device: str = "cpu", progress: Progress = silent, backbone: DinoV2 | None = None
+) -> TrainResult:
+    """Train the head of ``config`` and write :func:`report_folder` beside it.
+
+    Arguments and errors are those of :func:`slamdepth.depth.training.loop.train_depth`.
+    """
+    from slamdepth.depth.training.loop import train_depth
+    from slamdepth.report.training import write_training_report
+
+    settings = config.model_dump(mode="json")
+    return train_depth(
+        config,
+        device=device,
+        progress=progress,
+        backbone=backbone,
+        readers=sequence_readers(),
+        on_result=lambda result: write_training_report(report_folder(result.output), result, settings),
+    )
+
+
+def plan_run(config: TrainConfig, *, device: str = "cpu", backbone: DinoV2 | None = None) -> TrainingPlan:
+    """What :func:`run_training` would take; errors of :func:`slamdepth.depth.training.plan.plan_training`."""
+    from slamdepth.depth.training.plan import plan_training
+
+    return plan_training(config, device=device, backbone=backbone, readers=sequence_readers())
+
+
+def run_search(
+    config: TrainConfig,
+    trials: int,
+    *,
+    device: str = "cpu",
+    progress: Progress = silent,
+    backbone: DinoV2 | None = None,
+) -> SearchResult:
+    """Tune ``config``; see :func:`slamdepth.depth.training.search.search_settings`."""
+    from slamdepth.depth.training.search import search_settings
+
+    return search_settings(
+        config, trials, device=device, progress=progress, backbone=backbone, readers=sequence_readers()
+    )

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sequences as places to train on: every layout of ``slamdepth.datasets``, by its name.
+
+The rooms ``depth`` and ``datasets`` don't know one another; here they meet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from slamdepth.datasets import Dataset, Reader, known_readers
+from slamdepth.datasets.sequence import ImageSequence, is_file
+from slamdepth.datasets.synth import SETTINGS_FILE
+from slamdepth.depth.training.data import PlaceReader, fingerprint
+from slamdepth.errors import DatasetError, ImageDecodeError
+from slamdepth.types import Camera, Frame
+
+_BENCHMARKS = {"tum": "sequences in the TUM RGB-D layout", "7scenes": "7-Scenes sequences"}
+"""What a head trained on a layout has seen; a recording of one's own in it counts too."""
+
+
+@dataclass(frozen=True)
+class SequencePlace:
+    """The frames of a sequence that have sensor depth, in raw (distorted) pixels.
+
+    Attributes:
+        frames: their indices in ``dataset``.
+    """
+
+    dataset: Dataset
+    frames: tuple[int, ...]
+    benchmark: str | None
+
+    @classmethod
+    def of(cls, dataset: Dataset, benchmark: str | None = None) -> SequencePlace:
+        """The frames of ``dataset`` whose image and depth are there; files are not opened.
+
+        Raises:
+            DatasetError: there are none.
+        """
+        if isinstance(dataset, ImageSequence):
+            paths = zip(dataset.image_paths, dataset.depth_paths, strict=True)
+            frames = tuple(
+                k for k, (image, depth) in enumerate(paths) if depth is not None and is_file(image)
+            )
+        else:
+            frames = tuple(range(len(dataset))) if dataset.has_depth else ()
+        if not frames:
+            raise DatasetError(f"{dataset.path}: has no sensor depth")
+        return cls(dataset, frames, benchmark)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def name(self) -> str:
+        return self.dataset.name
+
+    @property
+    def camera(self) -> Camera:
+        return self.dataset.camera
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return tuple(self.dataset.notes)
+
+    @property
+    def fingerprint(self) -> str:
+        if isinstance(self.dataset, ImageSequence):
+            both = (self.dataset.image_paths, self.dataset.depth_paths)
+            files = (path for paths in both for k in self.frames if (path := paths[k]) is not None)
+            return fingerprint(files, self.camera, self.frames)
+        times = np.asarray(self.dataset.timestamps_s).tolist()
+        return fingerprint((), str(self.dataset.path), times, self.camera, self.frames)
+
+    def read(self, index: int) -> Frame:
+        """Frame ``index`` of those with depth; see :meth:`slamdepth.depth.training.data.Place.read`."""
+        try:
+            frame = self.dataset.read(self.frames[index], with_depth=True)
+        except ImageDecodeError as error:
+            raise DatasetError(str(error)) from error
+        if frame.depth_m is None:
+            raise DatasetError(f"{self.dataset.path}: frame {self.frames[index]} has no depth")
+        return replace(frame, index=index)
+
+
+@dataclass(frozen=True)
+class SequenceReader:
+    """A reader of sequences as a reader of places."""
+
+    reader: Reader
+
+    @property
+    def name(self) -> str:
+        return self.reader.name
+
+    @property
+    def needs(self) -> str:
+        return f"{self.reader.needs}; depth is not optional here"
+
+    def matches(self, folder: Path) -> bool:
+        return self.reader.matches(folder)
+
+    def open(self, folder: Path) -> SequencePlace:
+        return SequencePlace.of(self.reader.open(folder, None), _BENCHMARKS.get(self.name))
+
+
+@dataclass(frozen=True)
+class SynthReader(SequenceReader):
+    """Opens what ``slamdepth synth`` renders: the TUM layout, but nothing of TUM's."""
+
+    @property
+    def name(self) -> str:
+        return "synth"
+
+    @property
+    def needs(self) -> str:
+        return f"a folder of 'slamdepth synth' with {SETTINGS_FILE}"
+
+    def matches(self, folder: Path) -> bool:
+        return (folder / SETTINGS_FILE).is_file()
+
+    def open(self, folder: Path) -> SequencePlace:
+        if not self.matches(folder):
+            raise DatasetError(f"{folder}: no {SETTINGS_FILE} here, so 'slamdepth synth' did not render it")
+        return super().open(folder)
+
+
+def sequence_readers() -> dict[str, PlaceReader]:
+    """Every sequence layout, and ``synth`` before the layout it is written in."""
+    layouts = {reader.name: reader for reader in known_readers()}
+    readers: dict[str, PlaceReader] = {"synth": SynthReader(layouts["tum"])}
+    readers.update({name: SequenceReader(reader) for name, reader in layouts.items()})
+    return readers

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a training leaves to look at: loss curves, sample predictions and figures of every epoch."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slamdepth.errors import OutputError
+from slamdepth.io import write_json, write_text
+from slamdepth.report.environment import hardware, versions
+from slamdepth.report.figure import new_figure, write_png
+from slamdepth.report.pictures import colour_depth, near_to_far
+
+if TYPE_CHECKING:
+    from slamdepth.depth.training.results import SampleView, TrainResult
+
+_COLOURS = ("#17458f", "#c8502b", "#2f9e4f", "#8a4fb0", "#b58a00", "#11787f")
+_README = """What a training of a depth head left here.
+
+losses.png     loss of every epoch, member by member: solid on the views trained on, dashed on
+               the held-out places. Left of the grey line the head is judged at 1/7 of the
+               resolution, right of it at all of it; the two are other numbers. Views trained on
+               are distorted and seen with dropout, held-out ones are not, so theirs can be lower.
+               Below it, AbsRel on the held-out places after one median a view.
+samples.png    views as the network saw them, what the sensor measured, what the finished head
+               predicts and how unsure it is of it (deviation of the log of depth, so 0.1 is
+               about 10 %). Depth is dark blue near, green, yellow far, and grey where unknown; sensor
+               and prediction of a row share one scale.
+history.json   these figures, places, settings, versions and hardware.
+
+The head itself is {output}; its header holds the settings too.
+"""
+
+
+def write_training_report(folder: Path, result: TrainResult, settings: dict[str, Any]) -> None:
+    """Write ``losses.png``, ``samples.png``, ``history.json`` and ``README.txt`` into ``folder``.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made: {error.strerror or error}") from error
+    write_json(
+        folder / "history.json",
+        {
+            "output": result.output.name,
+            "trained_on": result.about["trained_on"],
+            "sigma_scale": result.sigma_scale,
+            "held_out": result.held_out,
+            "places": result.places,
+            "epochs": [asdict(figures) for figures in result.history],
+            "backbone_sha256": result.about["backbone_sha256"],
+            "settings": settings,
+            "versions": versions(),
+            "hardware": hardware(),
+        },
+    )
+    if result.history:
+        draw_losses(folder / "losses.png", result)
+    if result.samples:
+        draw_samples(folder / "samples.png", result.samples)
+    write_text(folder / "README.txt", _README.format(output=result.output.name))
+
+
+def draw_losses(path: Path, result: TrainResult) -> None:
+    """Loss, and where there are held-out places their AbsRel, over epochs, a colour a member."""
+    history = result.history
+    is_judged = any(figures.held_out_loss is not None for figures in history)
+    figure, axes = new_figure(9.0, 6.4 if is_judged else 3.8, 2 if is_judged else 1, 1, sharex=True)
+    members = sorted({figures.member for figures in history})
+    for member in members:
+        own = [figures for figures in history if figures.member == member]
+        colour, name = _COLOURS[member % len(_COLOURS)], f"member {member + 1}"
+        for is_fine in (False, True):
+            stage = [figures for figures in own if figures.is_fine is is_fine]
+            if not stage:
+                continue
+            epochs = [figures.epoch + 1 for figures in stage]
+            label = name if stage[0] is own[0] else None
+            axes[0, 0].plot(epochs, [f.loss for f in stage], "o-", color=colour, ms=3, label=label)
+            if is_judged:
+                judged = [np.nan if f.held_out_loss is None else f.held_out_loss for f in stage]
+                label = f"{name}, held out" if label else None
+                axes[0, 0].plot(epochs, judged, "s--", color=colour, ms=3, label=label)
+                errors = [np.nan if f.held_out_abs_rel is None else f.held_out_abs_rel for f in stage]
+                axes[1, 0].plot(epochs, errors, "s--", color=colour, ms=3)
+    fine = [figures.epoch for figures in history if figures.is_fine]
+    for panel in axes[:, 0]:
+        panel.grid(True, color="#dddddd", lw=0.6)
+        panel.spines[["top", "right"]].set_visible(False)
+        if fine and min(fine) > 0:
+            panel.axvline(min(fine) + 0.5, color="#999999", lw=1.0)
+    last = max(figures.epoch for figures in history) + 1
+    axes[0, 0].set(ylabel="loss", title="Loss by epoch")
+    axes[0, 0].legend(frameon=False, ncols=2, fontsize=8)
+    if is_judged:
+        places = ", ".join(result.held_out)
+        axes[1, 0].set(
+            ylabel="AbsRel", ylim=(0, None), title=f"Held out ({places}): AbsRel after one median a view"
+        )
+    axes[-1, 0].set(xlabel="epoch", xlim=(0.5, last + 0.5))
+    axes[-1, 0].xaxis.get_major_locator().set_params(integer=True)
+    write_png(figure, path)
+
+
+def draw_samples(path: Path, samples: tuple[SampleView, ...]) -> None:
+    """A row a sample: image, sensor depth, prediction, deviation of its log."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    rows, columns = samples[0].image_rgb.shape[:2]
+    width = 11.5
+    figure, axes = new_figure(
+        width, 0.4 + len(samples) * (0.195 * width * rows / columns + 0.2), len(samples), 4
+    )
+    depth_colours = near_to_far()
+    surest, most_unsure = np.percentile(np.concatenate([s.sigma_log.ravel() for s in samples]), (2, 98))
+    for row, sample in zip(axes, samples, strict=True):
+        known = sample.sensor_m[sample.sensor_m > 0]
+        both = np.concatenate([known, sample.predicted_m.ravel()])
+        near_m, far_m = (float(v) for v in np.percentile(both, (1, 98)))
+        row[0].imshow(sample.image_rgb)
+        row[1].imshow(colour_depth(sample.sensor_m, near_m, far_m), interpolation="nearest")
+        row[2].imshow(colour_depth(sample.predicted_m, near_m, far_m), interpolation="nearest")
+        unsure = row[3].imshow(
+            sample.sigma_log, cmap="magma", vmin=surest, vmax=most_unsure, interpolation="nearest"
+        )
+        scale = ScalarMappable(Normalize(near_m, far_m), depth_colours)
+        figure.colorbar(scale, ax=row[2], shrink=0.85, label="m")
+        figure.colorbar(unsure, ax=row[3], shrink=0.85)
+        row[0].set_ylabel(f"{sample.place}\n{'held out' if sample.is_held_out else 'trained on'}", fontsize=8)
+        for panel in row:
+            panel.set(xticks=[], yticks=[])
+    titles = ("image", "sensor depth", "predicted depth", "deviation of log depth")
+    for panel, title in zip(axes[0], titles, strict=True):
+        panel.set_title(title, fontsize=10)
+    write_png(figure, path)
