@@ -14,7 +14,7 @@ from training_places import make_place
 from slamdepth.depth.training.augment import View, mixed_view
 from slamdepth.depth.training.config import AugmentConfig, ViewConfig
 from slamdepth.depth.training.data import open_place
-from slamdepth.depth.training.views import SampleKey, make_view
+from slamdepth.depth.training.views import Partner, SampleKey, make_view
 
 RED, BLUE = (200, 0, 0), (0, 0, 200)
 DEPTHS = arrays(np.float32, (6, 9), elements=st.sampled_from([0.0, 0.5, 1.0, 2.0, 4.0]))
@@ -65,8 +65,9 @@ def test_mixed_views_are_the_same_for_the_same_seed(tmp_path: Path) -> None:
     places = [open_place(make_place(tmp_path / name)) for name in ("hall", "loft")]
     config = ViewConfig(rows=56, columns=70, augment=AugmentConfig(mixed=1.0, mixed_again=1.0))
     key = SampleKey(0, 1, 2)
-    once, again = (make_view(places, key, config, seed=3) for _ in range(2))
+    partners = [Partner(place, config.augment, weight) for place, weight in zip(places, (1, 3), strict=True)]
+    once, again = (make_view(places, key, config, 3, partners) for _ in range(2))
     np.testing.assert_array_equal(once.image_rgb, again.image_rgb)
     np.testing.assert_array_equal(once.depth_m, again.depth_m)
-    alone = make_view(places, key, ViewConfig(rows=56, columns=70), seed=3)
+    alone = make_view(places, key, ViewConfig(rows=56, columns=70), 3, partners)
     assert (alone.image_rgb != once.image_rgb).any()

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from slamdepth.depth import weights as store
@@ -13,7 +13,7 @@ from slamdepth.depth.training.config import TrainConfig, ViewConfig, digest
 from slamdepth.depth.training.data import Place, PlaceReader, data_folder, open_place
 from slamdepth.depth.training.features import FeatureCache, build_cache
 from slamdepth.depth.training.progress import Progress, silent
-from slamdepth.depth.training.views import SampleKey, plan_plain, plan_samples
+from slamdepth.depth.training.views import Partner, SampleKey, plan_plain, plan_samples
 from slamdepth.errors import ConfigError
 
 _JUDGED_VIEWS = 50
@@ -29,6 +29,7 @@ class PlannedCache:
         folder: where it is kept; its name hashes all that decides on its content.
         keys: its samples, in order.
         view: how they are made.
+        partners: what is mixed into them: all places that are trained on.
         held_out: name of the place where it is for judging, else None.
     """
 
@@ -37,6 +38,7 @@ class PlannedCache:
     keys: tuple[SampleKey, ...]
     view: ViewConfig
     held_out: str | None = None
+    partners: tuple[Partner, ...] = ()
 
 
 def plan_caches(
@@ -75,8 +77,23 @@ def plan_caches(
         view = config.view
         if source.augment is not None:
             view = view.model_copy(update={"augment": source.augment})
-        folder_of = where(view, places, source.places, source.limit)
-        planned.append(PlannedCache(folder_of, places, tuple(keys), view))
+        planned.append(
+            PlannedCache(where(view, places, source.places, source.limit), places, tuple(keys), view)
+        )
+    partners = tuple(
+        Partner(place, cache.view.augment, sum(key.place == index for key in cache.keys))
+        for cache in planned
+        for index, place in enumerate(cache.places)
+    )
+    mixing = [(p.place.fingerprint, p.augment.model_dump_json(), p.weight) for p in partners]
+    planned = [
+        replace(
+            cache, partners=partners, folder=cache.folder.with_name(digest(cache.view, cache.folder.name, mixing))
+        )
+        if cache.view.augment.mixed
+        else cache
+        for cache in planned
+    ]
     for folder, source in both:
         for name in source.held_out:
             place = open_place(folder / name, source.reader, readers)
@@ -99,7 +116,7 @@ def fill_cache(
     """Compute what is missing of ``planned``; errors of :func:`build_cache`."""
     return build_cache(
         planned.folder, planned.places, planned.keys, planned.view, backbone, config.head.taps, config.seed,
-        device=device, progress=progress, stage=stage,
+        device=device, partners=planned.partners, progress=progress, stage=stage,
     )  # fmt: skip
 
 

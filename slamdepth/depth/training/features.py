@@ -20,7 +20,7 @@ from slamdepth.depth.training.config import ViewConfig
 from slamdepth.depth.training.data import Place
 from slamdepth.depth.training.progress import Progress, TrainStep, silent
 from slamdepth.depth.training.store import SampleStore, Spec, locked
-from slamdepth.depth.training.views import SampleKey, canonical_depth, make_view
+from slamdepth.depth.training.views import Partner, SampleKey, canonical_depth, make_view
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -79,10 +79,14 @@ def build_cache(
     *,
     device: str = "cpu",
     batch: int = 4,
+    partners: Sequence[Partner] = (),
     progress: Progress = silent,
     stage: str = "features",
 ) -> FeatureCache:
     """Fill (or finish filling) the cache in ``folder`` and open it.
+
+    Args:
+        partners: what is mixed into the views.
 
     Raises:
         DatasetError: an image or its depth cannot be read.
@@ -94,7 +98,7 @@ def build_cache(
         if groups:
             logger.info("computing %d of %d samples into %s", sum(map(len, groups)), len(keys), folder)
         for count, group in enumerate(groups, start=1):
-            views = [make_view(places, keys[k], config, seed) for k in group]
+            views = [make_view(places, keys[k], config, seed, partners) for k in group]
             tokens, class_tokens = encode([view.image_rgb for view in views], backbone, taps, device)
             store.put(
                 group,

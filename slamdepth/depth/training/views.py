@@ -12,7 +12,7 @@ import numpy as np
 
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
 from slamdepth.depth.training.augment import View, augmented_view, mixed_view, plain_view
-from slamdepth.depth.training.config import ViewConfig
+from slamdepth.depth.training.config import AugmentConfig, ViewConfig
 from slamdepth.depth.training.data import Place
 
 if TYPE_CHECKING:
@@ -26,6 +26,20 @@ class SampleKey:
     place: int
     frame: int
     copy: int
+
+
+@dataclass(frozen=True)
+class Partner:
+    """A place whose views are mixed into others.
+
+    Attributes:
+        augment: what is done to its views.
+        weight: how often it is drawn, beside the others.
+    """
+
+    place: Place
+    augment: AugmentConfig
+    weight: float
 
 
 def plan_samples(places: Sequence[Place], samples: Sequence[int], seed: int) -> list[SampleKey]:
@@ -53,25 +67,29 @@ def plan_plain(place_index: int, place: Place, limit: int) -> list[SampleKey]:
     return [SampleKey(place_index, int(frame), -1) for frame in chosen]
 
 
-def make_view(places: Sequence[Place], key: SampleKey, config: ViewConfig, seed: int) -> View:
+def make_view(
+    places: Sequence[Place], key: SampleKey, config: ViewConfig, seed: int, partners: Sequence[Partner] = ()
+) -> View:
     """The view ``key`` names; the same for the same seed whatever else is made.
 
-    Views mixed into it are of any of ``places``, every pair as likely.
+    Args:
+        partners: what is mixed into it, as often as ``config.augment.mixed`` says.
     """
     place = places[key.place]
     if key.copy < 0:
         return plain_view(place.read(key.frame), config.rows, config.columns)
     rng = np.random.default_rng([seed, zlib.crc32(place.name.encode()), key.frame, key.copy])
-    ends = np.cumsum([len(other) for other in places])
+
+    def view_of(place: Place, frame: int, augment: AugmentConfig) -> View:
+        return augmented_view(place.read(frame), config.rows, config.columns, augment, rng)
 
     def another() -> View:
-        k = int(rng.integers(ends[-1]))
-        index = int(np.searchsorted(ends, k, side="right"))
-        frame = places[index].read(k - int(ends[index]) + len(places[index]))
-        return augmented_view(frame, config.rows, config.columns, config.augment, rng)
+        weights = np.array([partner.weight for partner in partners])
+        chosen = partners[rng.choice(len(partners), p=weights / weights.sum())]
+        return view_of(chosen.place, int(rng.integers(len(chosen.place))), chosen.augment)
 
-    view = augmented_view(place.read(key.frame), config.rows, config.columns, config.augment, rng)
-    if rng.random() < config.augment.mixed:
+    view = view_of(place, key.frame, config.augment)
+    if partners and rng.random() < config.augment.mixed:
         view = mixed_view(view, another())
         if rng.random() < config.augment.mixed_again:
             view = mixed_view(view, another())
