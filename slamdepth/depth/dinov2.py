@@ -166,6 +166,19 @@ class DinoV2(nn.Module):
         return cached
 
 
+def working_type(device: str) -> torch.dtype:
+    """What the backbone computes in: bfloat16 on a CPU that multiplies it natively, float32 elsewhere.
+
+    It nearly halves the time of a prediction and changes depth by about half a per cent,
+    where the head errs by ten.
+    """
+    if device != "cpu" or not hasattr(torch.cpu, "get_capabilities"):
+        return torch.float32
+    capabilities = torch.cpu.get_capabilities()
+    native = capabilities.get("avx512_bf16", False) or capabilities.get("amx_bf16", False)
+    return torch.bfloat16 if native else torch.float32
+
+
 def load_dinov2(path: Path, device: str = "cpu") -> DinoV2:
     """The ViT-S/14 of a safetensors or official ``.pth`` file, frozen, in eval mode.
 

@@ -22,6 +22,8 @@ from slamdepth.depth.layout import check_layout, pack_about, unpack_about
 from slamdepth.errors import WeightsError
 
 _FACTOR = 7
+UPSAMPLING = "weights."
+"""Prefix of the parameters that only the upsampling to full resolution uses."""
 FORMAT = "slamdepth-depth-head-1"
 
 

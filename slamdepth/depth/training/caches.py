@@ -29,6 +29,7 @@ class PlannedCache:
         folder: where it is kept; its name hashes all that decides on its content.
         keys: its samples, in order.
         view: how they are made.
+        members: heads that learn from it; None where all do.
         partners: what is mixed into them: all places that are trained on.
         held_out: name of the place where it is for judging, else None.
     """
@@ -39,6 +40,7 @@ class PlannedCache:
     view: ViewConfig
     held_out: str | None = None
     partners: tuple[Partner, ...] = ()
+    members: tuple[int, ...] | None = None
 
 
 def plan_caches(
@@ -60,8 +62,9 @@ def plan_caches(
     judged = {(root / name).resolve() for root, source in both for name in source.held_out}
     if trained & judged:
         raise ConfigError(f"setting 'sources': {min(trained & judged).name} is held out and also trained on")
-    if not trained:
-        raise ConfigError("setting 'sources': there is no place to train on")
+    for member in range(config.members):
+        if not any(source.places and _teaches(source.members, member) for source in config.sources):
+            raise ConfigError(f"setting 'sources': there is no place to train on for member {member}")
 
     def where(view: ViewConfig, places: tuple[Place, ...], *more: object) -> Path:
         made_of = [place.fingerprint for place in places]
@@ -78,7 +81,13 @@ def plan_caches(
         if source.augment is not None:
             view = view.model_copy(update={"augment": source.augment})
         planned.append(
-            PlannedCache(where(view, places, source.places, source.limit), places, tuple(keys), view)
+            PlannedCache(
+                where(view, places, source.places, source.limit),
+                places,
+                tuple(keys),
+                view,
+                members=source.members,
+            )
         )
     partners = tuple(
         Partner(place, cache.view.augment, sum(key.place == index for key in cache.keys))
@@ -88,7 +97,9 @@ def plan_caches(
     mixing = [(p.place.fingerprint, p.augment.model_dump_json(), p.weight) for p in partners]
     planned = [
         replace(
-            cache, partners=partners, folder=cache.folder.with_name(digest(cache.view, cache.folder.name, mixing))
+            cache,
+            partners=partners,
+            folder=cache.folder.with_name(digest(cache.view, cache.folder.name, mixing)),
         )
         if cache.view.augment.mixed
         else cache
@@ -102,6 +113,19 @@ def plan_caches(
                 PlannedCache(where(config.view, (place,), "plain"), (place,), tuple(keys), config.view, name)
             )
     return planned
+
+
+def _teaches(members: tuple[int, ...] | None, member: int) -> bool:
+    return members is None or member in members
+
+
+def of_member(planned: list[PlannedCache], caches: list[FeatureCache], member: int) -> list[FeatureCache]:
+    """The caches that ``member`` is trained on."""
+    return [
+        cache
+        for plan, cache in zip(planned, caches, strict=True)
+        if plan.held_out is None and _teaches(plan.members, member)
+    ]
 
 
 def fill_cache(

@@ -52,6 +52,12 @@ class SourceConfig(_Section):
         None, description="layout: pairs, hypersim, synth, tum, 7scenes; found out from the files if absent"
     )
     places: tuple[PlaceConfig, ...] = Field((), description="trained on")
+    members: tuple[int, ...] | None = Field(
+        None,
+        min_length=1,
+        description="heads that learn from it, from 0; all if absent: heads that know "
+        "different things are worth more together than heads that differ by seed",
+    )
     augment: AugmentConfig | None = Field(None, description="of this source's views; view.augment if absent")
     held_out: tuple[str, ...] = Field((), description="places judged on after training, never trained on")
     limit: int | None = Field(
@@ -115,9 +121,13 @@ class TrainConfig(_Section):
     seed: int = Field(0, ge=0)
     members: int = Field(1, ge=1, le=16, description="heads trained from different seeds and averaged")
     coarse_epochs: int = Field(10, ge=0, description="epochs judged at 1/7 resolution, before the upsampling")
-    fine_epochs: int = Field(2, ge=0, description="epochs judged at full resolution, after them")
+    fine_epochs: int = Field(
+        1, ge=0, description="epochs at full resolution, after them, that train the upsampling alone"
+    )
     batch: int = Field(16, ge=1)
-    learning_rate: float = Field(2e-3, gt=0, description="peak; a tenth of it in the fine epochs")
+    learning_rate: float = Field(
+        2e-3, gt=0, description="peak, in the coarse epochs and again in the fine ones"
+    )
     weight_decay: float = Field(0.05, ge=0)
     sigma_scale: float = Field(
         1.0, gt=0, description="calibration of sigma; measured instead where there are held-out places"

@@ -125,7 +125,8 @@ def encode(
     import torch
 
     with torch.inference_mode():
-        tapped = backbone(normalised(np.stack(images_rgb), device), taps)
+        image = normalised(np.stack(images_rgb), device).to(backbone.cls_token.dtype)
+        tapped = backbone(image, taps)
         tokens = torch.stack([grid for grid, _ in tapped], dim=1)
         class_tokens = torch.stack([token for _, token in tapped], dim=1)
     return tokens.half().cpu().numpy(), class_tokens.half().cpu().numpy()

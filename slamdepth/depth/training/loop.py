@@ -2,8 +2,8 @@
 """Training of a depth head on cached features.
 
 First epochs at 1/7 resolution, where a step costs a fifth, then a few at full resolution
-for the edges. After every epoch a checkpoint is written; a killed training goes on from
-it to the same result, bit for bit.
+for the edges, which train the upsampling alone. After every epoch a checkpoint is written; a
+killed training goes on from it to the same result, bit for bit.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from torch import nn
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.checkpoints import check_device
-from slamdepth.depth.dinov2 import DinoV2, load_dinov2
-from slamdepth.depth.head import DepthHead, HeadEnsemble, HeadShape, save_head
-from slamdepth.depth.training.caches import PlannedCache, benchmarks_seen, fill_cache, plan_caches
+from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
+from slamdepth.depth.head import UPSAMPLING, DepthHead, HeadEnsemble, HeadShape, save_head
+from slamdepth.depth.training.caches import PlannedCache, benchmarks_seen, fill_cache, of_member, plan_caches
 from slamdepth.depth.training.checkpoint import (
     checkpoint_path,
     load_checkpoint,
@@ -81,7 +81,7 @@ def train_depth(
     if backbone is None:
         file = store.find_backbone(config.backbone)
         backbone_sha256 = store.verify(file)
-        backbone = load_dinov2(file, device)
+        backbone = load_dinov2(file, device).to(working_type(device))
 
     planned = plan_caches(config, backbone_sha256, readers)
     seen = [f"{benchmark} ({', '.join(names)})" for benchmark, names in benchmarks_seen(planned).items()]
@@ -91,7 +91,6 @@ def train_depth(
         fill_cache(plan, config, backbone, device=device, progress=progress, stage=_stage(plan, k, planned))
         for k, plan in enumerate(planned)
     ]
-    training = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is None]
     judging = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None]
     shape = HeadShape(
         config.head.taps, backbone.dim, config.head.dim, config.head.blocks, config.head.guide_dim,
@@ -101,6 +100,7 @@ def train_depth(
     ensemble = HeadEnsemble(shape)
     history: list[EpochFigures] = []
     for member in range(config.members):
+        training = of_member(planned, caches, member)
         head, epochs = _train_member(config, training, judging, shape, member, key, device, progress)
         ensemble.members[member].load_state_dict(head.state_dict())
         history += epochs
@@ -212,6 +212,9 @@ def _epoch(
     progress: Progress,
 ) -> float:
     head.train()
+    is_fine = epoch >= config.coarse_epochs
+    for name, parameter in head.named_parameters():  # more at full resolution only learns places by heart
+        parameter.requires_grad_(not is_fine or name.startswith(UPSAMPLING))
     samples = np.array([(c, k) for c, cache in enumerate(caches) for k in range(len(cache))])
     order = np.random.default_rng([_seed(config, member), epoch]).permutation(len(samples))
     steps = steps_per_epoch(config, len(samples))
@@ -225,7 +228,7 @@ def _epoch(
         ]
         tokens, class_tokens, image, target = (torch.cat(part) for part in zip(*parts, strict=True))
         batch = (tokens, class_tokens, image, target)
-        loss = total_loss(*predict(head, batch, epoch >= config.coarse_epochs), config.loss)
+        loss = total_loss(*predict(head, batch, is_fine), config.loss)
         for group in optimiser.param_groups:
             group["lr"] = learning_rate(config, epoch + step / steps)
         optimiser.zero_grad()
@@ -258,9 +261,9 @@ def _how_far(config: TrainConfig, member: int, epoch: int, step: int, steps: int
 
 def learning_rate(config: TrainConfig, epoch: float) -> float:
     """The rate ``epoch`` (with its fraction) into a training: a warm-up, then half a cosine
-    to nothing over the coarse epochs, and another from a tenth over the fine ones."""
+    to nothing over the coarse epochs, and another over the fine ones."""
     if epoch < config.coarse_epochs:
         share = epoch / config.coarse_epochs
         return config.learning_rate * min(1.0, 0.04 + share / 0.08) * 0.5 * (1 + math.cos(math.pi * share))
     share = (epoch - config.coarse_epochs) / max(1, config.fine_epochs)
-    return 0.1 * config.learning_rate * 0.5 * (1 + math.cos(math.pi * min(share, 1.0)))
+    return config.learning_rate * 0.5 * (1 + math.cos(math.pi * min(share, 1.0)))
