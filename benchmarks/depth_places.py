@@ -66,11 +66,11 @@ def config_without(
     if left_out is not None and left_out not in places_of(base):
         raise ConfigError(f"'{left_out}' cannot be left out; there are: {', '.join(places_of(base))}")
     sources = []
-    for number, source in enumerate(base.sources):
+    for source in base.sources:
         total = sum(place.samples for place in source.places)
         share = min(1.0, source.limit / total) if source.limit else 1.0
         for place in source.places:
-            if number == 0 and place.name == left_out:
+            if source.folder == base.sources[0].folder and place.name == left_out:
                 continue
             views = max(1, round(place.samples * share))
             views = views if samples is None else min(views, samples)
@@ -141,7 +141,8 @@ def main(arguments: list[str]) -> int:
     try:
         base = TrainConfig.from_yaml(asked.config)
         if asked.first_source_only:
-            base = base.model_copy(update={"sources": base.sources[:1]})
+            real = tuple(s for s in base.sources if s.folder == base.sources[0].folder)
+            base = base.model_copy(update={"sources": real})
         with Bar(console=console, disable=not console.is_terminal, transient=True) as bar:
 
             def train(config: TrainConfig) -> object:

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.depth_ablation import VARIANTS, variant_config
 from benchmarks.depth_baseline_models import ConstantDepth, MeanImageDepth, PixelMlp
 from benchmarks.depth_baselines import main as baselines
-from benchmarks.depth_places import config_without, leave_one_out, places_of
+from benchmarks.depth_places import DEFAULT_CONFIG, config_without, leave_one_out, places_of
 from benchmarks.depth_rows import judged_row, mean_row, table
 from slamdepth.depth.dinov2_mlp import MlpHead
 from slamdepth.depth.training.config import TrainConfig
@@ -227,3 +228,28 @@ def test_latency_tables_say_what_could_not_be_measured(
     assert depth_latency.main(["--sizes", "30x30"]) == 2
     assert "multiples of 14" in capsys.readouterr().err
     assert depth_latency.main(["--variants", "int3"]) == 2
+
+
+def test_each_variant_of_the_ablation_changes_what_it_says() -> None:
+    base = TrainConfig.from_yaml(DEFAULT_CONFIG)
+    real = base.sources[0].folder
+    made = {label: variant_config(base, change, samples=5, steps=20) for label, change in VARIANTS.items()}
+    whole = made["as shipped"]
+    assert whole.members == 1
+    assert all(source.members is None for source in whole.sources)
+    assert {s.folder == real for s in whole.sources} == {True, False}
+    assert {s.folder == real for s in made["real places only"].sources} == {True}
+    assert {s.folder == real for s in made["synthetic rooms only"].sources} == {False}
+    assert not any(s.augment and s.augment.mixed for s in made["no mixing of scenes"].sources)
+    assert made["last block only"].head.taps == (11,)
+    assert (made["likelihood only"].loss.gradient, made["likelihood only"].loss.scale_invariant) == (0, 0)
+    unlike = [config.model_dump() for config in made.values()]
+    assert all(a != b for k, a in enumerate(unlike) for b in unlike[:k])
+
+
+def test_a_left_out_place_is_left_out_of_every_source() -> None:
+    base = TrainConfig.from_yaml(DEFAULT_CONFIG)
+    config = config_without(base, "cafe_nyu", Path("head.safetensors"))
+    names = [place.name for source in config.sources for place in source.places]
+    assert "cafe_nyu" not in names
+    assert "desk_kinect" in names

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Heads that learn from different sources, and fine epochs that leave the coarse map alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from killed_training import tiny_backbone
+from training_places import make_place
+
+from slamdepth.depth.head import UPSAMPLING, load_head
+from slamdepth.depth.training import loop
+from slamdepth.depth.training.config import TrainConfig
+from slamdepth.depth.training.features import FeatureCache
+from slamdepth.errors import ConfigError
+
+
+@pytest.fixture
+def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    monkeypatch.setenv("SLAMDEPTH_CACHE", str(tmp_path / "cache"))
+    data = str(tmp_path / "data")
+    sources = []
+    for name, members in (("hall", [0]), ("loft", [1]), ("yard", None)):
+        make_place(tmp_path / "data" / name, 2)
+        sources.append({"folder": data, "members": members, "places": [{"name": name, "samples": 4}]})
+    return {
+        "output": str(tmp_path / "head.safetensors"),
+        "members": 2,
+        "coarse_epochs": 1,
+        "fine_epochs": 1,
+        "batch": 4,
+        "sources": sources,
+        "view": {"rows": 28, "columns": 42},
+        "head": {"taps": [0, 1], "dim": 16, "guide_dim": 8},
+    }
+
+
+def train(settings: dict[str, Any]) -> loop.TrainResult:
+    return loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone())
+
+
+def test_a_member_learns_from_its_sources_alone(
+    settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[int, int]] = []
+    real = loop._epoch
+
+    def spy(config: TrainConfig, caches: list[FeatureCache], *rest: Any) -> float:
+        seen.append((rest[3], sum(len(cache) for cache in caches)))  # rest: head, optimiser, epoch, member
+        return real(config, caches, *rest)
+
+    monkeypatch.setattr(loop, "_epoch", spy)
+    train(settings)
+    assert seen == [(0, 8), (0, 8), (1, 8), (1, 8)]  # its own place and the common one
+
+
+def test_a_member_without_a_place_is_an_error(settings: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="no place to train on for member 1"):
+        train({**settings, "sources": settings["sources"][:1]})
+
+
+def test_fine_epochs_train_the_upsampling_alone(settings: dict[str, Any]) -> None:
+    coarse, _ = load_head(train({**settings, "fine_epochs": 0}).output)
+    fine, _ = load_head(train(settings).output)
+    changed = {
+        name
+        for (name, before), after in zip(coarse.state_dict().items(), fine.state_dict().values(), strict=True)
+        if not torch.equal(before, after)
+    }
+    assert changed
+    assert all(name.split(".", 2)[2].startswith(UPSAMPLING) for name in changed)
