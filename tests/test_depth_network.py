@@ -160,17 +160,17 @@ def test_convex_upsampling_stays_between_its_neighbours() -> None:
     torch.testing.assert_close(convex_upsample(coarse, logits.reshape(1, 441, 4, 5)), repeated)
 
 
-def test_disagreement_of_members_adds_to_sigma() -> None:
-    torch.manual_seed(0)
-    head = HeadEnsemble(SMALL).eval()
-    head.members[1].load_state_dict(head.members[0].state_dict())
-    args = torch.randn(1, 2, 24, 2, 3), torch.randn(1, 2, 24), torch.randn(1, 3, 28, 42)
+def test_depth_is_the_mean_of_the_members_and_sigma_their_geometric_mean() -> None:
+    torch.manual_seed(3)
+    model = HeadEnsemble(SMALL, sigma_scale=2.0).eval()
+    args = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56)
     with torch.inference_mode():
-        agreed, sigma = head(*args)
-        head.members[1].out.bias[0] += 1.0
-        moved, wider = head(*args)
-    torch.testing.assert_close(moved, agreed + 0.5)
-    torch.testing.assert_close(wider.square(), sigma.square() + 0.25)
+        outs = [member(*args) for member in model.members]
+        log_depth, sigma = model(*args)
+    torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
+    # the deviation of a Laplace distribution is the root of 2 times its spread
+    spread = (outs[0][:, 1].exp() * outs[1][:, 1].exp()).sqrt()
+    torch.testing.assert_close(sigma, 2.0 * 2.0**0.5 * spread)
 
 
 def test_head_file_round_trip(tmp_path: Path) -> None:
