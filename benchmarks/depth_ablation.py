@@ -39,7 +39,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no gradient loss": {"gradient": 0.0},
     "likelihood only": {"gradient": 0.0, "scale_invariant": 0.0},
 }
-_MEMBER = 0
+_MEMBER = 1
 _SECTIONS = {"dropout": "head", "taps": "head", "dim": "head", "blocks": "head", "gradient": "loss",
              "scale_invariant": "loss"}  # fmt: skip
 
@@ -75,7 +75,7 @@ def variant_config(base: TrainConfig, change: dict[str, Any], *, samples: int, s
 
 
 def _is_of_all(source: dict[str, Any]) -> bool:
-    """One head learns what the shipped head's first member does, which has seen everything."""
+    """One head learns what the shipped head's second member does, which has seen everything."""
     return source["members"] is None or _MEMBER in source["members"]
 
 
