@@ -11,10 +11,8 @@ import torch
 from killed_training import tiny_backbone
 from training_places import make_place
 
-from slamdepth.depth.head import UPSAMPLING, DepthHead, load_head
+from slamdepth.depth.head import UPSAMPLING, load_head
 from slamdepth.depth.training import loop
-from slamdepth.depth.training.caches import fill_cache, plan_caches
-from slamdepth.depth.training.centring import centre
 from slamdepth.depth.training.config import TrainConfig
 from slamdepth.depth.training.features import FeatureCache
 from slamdepth.errors import ConfigError
@@ -74,19 +72,3 @@ def test_fine_epochs_train_the_upsampling_alone(settings: dict[str, Any]) -> Non
     }
     assert changed
     assert all(name.split(".", 2)[2].startswith(UPSAMPLING) for name in changed)
-
-
-def test_a_member_of_mixed_scenes_is_centred_on_views_that_are_not(settings: dict[str, Any]) -> None:
-    mixed = {"mixed": 1.0}
-    sources = [{**settings["sources"][0], "augment": mixed}, settings["sources"][1]]
-    moved = train({**settings, "sources": sources})
-    config = TrainConfig.from_dict({**settings, "sources": sources})
-    planned = plan_caches(config, "given")
-    caches = [fill_cache(plan, config, tiny_backbone()) for plan in planned]
-    for head in load_head(moved.output)[0].members:
-        assert isinstance(head, DepthHead)
-        assert centre(head, planned, caches, "cpu") == pytest.approx(0.0, abs=2e-3)  # of half precision
-        with torch.no_grad():
-            head.out.bias[0] += 0.7
-        assert centre(head, planned, caches, "cpu") == pytest.approx(0.7, abs=2e-3)
-    assert centre(head, planned[:1], caches[:1], "cpu") == 0.0  # nothing to centre by

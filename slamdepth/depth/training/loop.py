@@ -25,7 +25,6 @@ from slamdepth.depth.checkpoints import check_device
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
 from slamdepth.depth.head import UPSAMPLING, DepthHead, HeadEnsemble, HeadShape, save_head
 from slamdepth.depth.training.caches import PlannedCache, benchmarks_seen, fill_cache, of_member, plan_caches
-from slamdepth.depth.training.centring import centre
 from slamdepth.depth.training.checkpoint import (
     checkpoint_path,
     load_checkpoint,
@@ -103,8 +102,6 @@ def train_depth(
     for member in range(config.members):
         training = of_member(planned, caches, member)
         head, epochs = _train_member(config, training, judging, shape, member, key, device, progress)
-        offset = centre(head, planned, caches, device)
-        logger.info("member %d: log depth was off by %+.3f on views that are not mixed", member, offset)
         ensemble.members[member].load_state_dict(head.state_dict())
         history += epochs
     ensemble.eval().to(device)
