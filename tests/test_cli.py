@@ -33,7 +33,7 @@ def report(run_folder: Path) -> dict[str, Any]:
     return dict(json.loads((run_folder / "report.json").read_text()))
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", ["", "weights", *COMMANDS])
 def test_every_command_explains_itself_with_an_example(command: str) -> None:
     done = slamdepth(*command.split(), "--help")
     assert done.returncode == 0

@@ -123,7 +123,7 @@ def test_a_sequence_that_shows_nothing(tiny_room: Path, tmp_path: Path) -> None:
 
 BAD_CALLS = {
     "missing folder": (("run", "/no/such/folder", "--depth", "sensor"), "/no/such/folder: no such folder"),
-    "a file": (("run", __file__, "--depth", "sensor"), "is a file"),
+    "a file": (("run", __file__, "--depth", "sensor"), "is a file; a sequence is a folder (of a video"),
     "no sequence": (("run",), "Missing argument 'SEQ'"),
     "unknown option": (("run", "SEQ", "--dept", "sensor"), "No such option: --dept"),
     "unknown command": (("rum", "SEQ"), "No such command 'rum'"),
@@ -142,6 +142,12 @@ BAD_CALLS = {
     "settings no YAML": ((*RUN, "--config", "GARBLED"), "not valid YAML"),
     "evaluate missing": (("evaluate", "/no/a.txt", "/no/b.txt"), "/no/a.txt: cannot be read"),
     "evaluate range": (("evaluate", "GT", "GT", "--max-difference", "0"), "must be positive"),
+    "evaluate over another file": (("evaluate", "GT", "GT", "-o", "FILE"), "no .json file; name another"),
+    "evaluate at no rate": (("evaluate", "GT", "GT", "--fps", "inf"), "must be positive and finite"),
+    "evaluate into a folder": (("evaluate", "GT", "GT", "-o", "BUSY"), "is a folder; name a file"),
+    "scale over another file": (("scale", "SEQ", "-o", "FILE"), "no .yaml file; name another"),
+    "no estimate": (("evaluate", "GT"), "evaluate [OPTIONS] GROUNDTRUTH ESTIMATE"),
+    "range below 0": (("depth", "SEQ", "--range", "-1", "2", "-o", "OUT"), "near (0 or more) to far"),
     "synth range": (("synth", "OUT", "--frames", "1"), "frames"),
     "synth into something else": (("synth", "BUSY"), "is not empty"),
     "unknown weights": (("weights", "pull", "resnet"), "unknown weights 'resnet'; choose from: "),

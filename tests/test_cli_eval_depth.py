@@ -101,6 +101,10 @@ def test_what_is_wrong_is_one_line(tiny_room: Path, pairs: Path, tmp_path: Path)
         (("dinov2", pairs, "--depth-weights", tmp_path / "x"), ""),
         (("sensor", pairs, "--camera", tmp_path / "c.yaml"), "leave out --camera"),
         (("sensor", pairs, "-o", tmp_path / "nowhere" / "x.json"), "no such folder to write to"),
+        (("sensor", pairs, "-o", tmp_path), "is a folder; name a file"),
+        (("sensor", pairs / "camera.json"), "is a file; name a folder"),
+        ((pairs, "sensor"), "the order is 'slamdepth eval-depth MODEL DATA...'"),
+        ((pairs,), "eval-depth [OPTIONS] MODEL DATA..."),
     ):
         done = call("eval-depth", *arguments)
         assert done.returncode != 0

@@ -125,7 +125,7 @@ def test_a_number_and_a_known_baseline(tiny_room: Path, tmp_path: Path) -> None:
         (("scale", "ROOM", "--depth", "sensor"), "in metres already"),
         (("scale", "ROOM", "--depth", "relative"), "fit both (--shift)"),
         (("scale", "ROOM", "--depth", "relative", "--shift"), "the same value everywhere"),
-        (("scale", "ROOM", "--depth", "flat", "-o", "absent/scale.yaml"), "name a file in a folder"),
+        (("scale", "ROOM", "--depth", "flat", "-o", "absent/scale.yaml"), "no such folder to write to"),
         (("run", "ROOM", "--depth", "sensor", "--depth-scale", "2"), "is for predicted depth"),
         (("run", "ROOM", "--depth", "sensor", "--depth-weights", "x"), "takes no weights file"),
         (("run", "ROOM", "--depth", "flat", "--depth-scale", "absent.yaml"), "cannot read the depth scale"),

@@ -24,7 +24,6 @@ _UsageProblem: type[Any] = next(cls for cls in typer.BadParameter.__mro__ if cls
 
 app = typer.Typer(
     name="slamdepth",
-    help="One camera in, a metric trajectory and a mesh out.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -60,7 +59,9 @@ def _everything(
 ) -> None:
     """One camera in, a metric trajectory and a mesh out.
 
-    Start with: slamdepth synth room, then slamdepth run room --depth sensor
+    Example: slamdepth synth room --frames 60, then slamdepth run room --depth sensor
+
+    'slamdepth COMMAND --help' tells what a command takes, with an example.
     """
 
 
@@ -77,8 +78,9 @@ def main() -> NoReturn:
     except _UsageProblem as problem:
         # typer shows the help itself where no command is given; its message is then empty.
         if message := problem.format_message():
-            command = getattr(getattr(problem, "ctx", None), "command_path", None) or "slamdepth"
-            _tell(f"{message} (see '{command} --help')")
+            context = getattr(problem, "ctx", None)
+            command = getattr(context, "command_path", None) or "slamdepth"
+            _tell(f"{message}{_order(context, message)} (see '{command} --help')")
         code = problem.exit_code
     except (KeyboardInterrupt, typer.Abort):
         _tell("interrupted")
@@ -88,6 +90,14 @@ def main() -> NoReturn:
         code = 1
     logging.shutdown()
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _order(context: Any, message: str) -> str:
+    """What a command takes, in order, where one of that is missing; empty elsewhere."""
+    if context is None or not message.startswith("Missing argument"):
+        return ""
+    pieces = " ".join(context.command.collect_usage_pieces(context))
+    return f" Usage: {context.command_path} {pieces.translate(str.maketrans('', '', '{}'))}"
 
 
 def _tell(message: str) -> None:

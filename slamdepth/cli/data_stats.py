@@ -18,7 +18,7 @@ def data_stats_command(
     data: Annotated[
         list[Path],
         typer.Argument(
-            metavar="DATA...",
+            metavar="DATA",
             help="Sequences with sensor depth, training pairs, Hypersim scenes, or folders of those.",
         ),
     ],

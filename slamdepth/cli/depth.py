@@ -59,8 +59,9 @@ def depth_command(
 
     Example: slamdepth depth holiday.mp4 --stride 5 --output holiday-depth
 
-    Metres need the focal length: from --camera, a camera.yaml beside the images, a known sequence,
-    or EXIF. Else it is guessed, and the results say so.
+    Metres need the focal length: --camera, a camera.yaml beside the images, a known sequence, or EXIF.
+
+    Else it is guessed, and the results say so.
 
     Ctrl-C keeps what is done; the same command goes on from there.
     """

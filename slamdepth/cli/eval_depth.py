@@ -22,11 +22,13 @@ _SHEET_FRAMES = 4
 
 
 def eval_depth_command(
-    model: Annotated[str, typer.Argument(metavar="MODEL", help="Depth model to judge, by name.")],
+    model: Annotated[
+        str, typer.Argument(metavar="MODEL", help="Depth model; an unknown name lists those there are.")
+    ],
     data: Annotated[
         list[Path],
         typer.Argument(
-            metavar="DATA...",
+            metavar="DATA",
             help="Sequences with sensor depth, training pairs, Hypersim scenes, or folders of those.",
         ),
     ],
@@ -55,13 +57,19 @@ def eval_depth_command(
     """
     show_log()
     from slamdepth.depth.registry import create_depth_model
-    from slamdepth.errors import OutputError
+    from slamdepth.errors import ConfigError
     from slamdepth.evaluation import Interval, mean_over_sets
     from slamdepth.pipeline.depth_data import open_depth_data, thinned
+    from slamdepth.pipeline.folder import writable_file
     from slamdepth.report.depth import judgement_lines, judgement_table
 
-    if output is not None and not output.parent.is_dir():
-        raise OutputError(f"{output.parent}: no such folder to write to; make it first")
+    if Path(model).is_dir():
+        raise ConfigError(
+            f"{model}: is a folder where the depth model's name belongs; the order is "
+            "'slamdepth eval-depth MODEL DATA...'"
+        )
+    if output is not None:
+        output = writable_file(output, ".json")
     places = [place for path in data for place in open_depth_data(path, camera=camera)]
     network = create_depth_model(model, device=device, weights=depth_weights)
     out = console()

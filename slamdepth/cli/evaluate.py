@@ -37,11 +37,14 @@ def evaluate_command(
     from slamdepth.errors import ConfigError
     from slamdepth.evaluation import MAX_DIFFERENCE_S, score_trajectory
     from slamdepth.io import read_tum_trajectory, write_json
+    from slamdepth.pipeline.folder import writable_file
     from slamdepth.report import trajectory_table
 
     for name, value in (("--max-difference", max_difference), ("--fps", fps)):
-        if value is not None and not value > 0:
-            raise ConfigError(f"{name} must be positive, got {value:g}")
+        if value is not None and not 0 < value < float("inf"):
+            raise ConfigError(f"{name} must be positive and finite, got {value:g}")
+    if output is not None:
+        output = writable_file(output, ".json")
     truth, truth_notes = read_tum_trajectory(ground_truth)
     estimated, estimate_notes = read_tum_trajectory(estimate)
     score = score_trajectory(

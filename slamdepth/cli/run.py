@@ -35,7 +35,10 @@ def run_command(
     ] = None,
     depth: Annotated[
         str | None,
-        typer.Option(metavar="dinov2|sensor", help="Where depth comes from. Default: dinov2"),
+        typer.Option(
+            metavar="NAME",
+            help="Depth model, or 'sensor'; an unknown name lists those there are. Default: dinov2",
+        ),
     ] = None,
     depth_weights: DepthWeightsOption = None,
     depth_scale: Annotated[
@@ -51,11 +54,11 @@ def run_command(
     ] = None,
     baseline_m: Annotated[
         float | None,
-        typer.Option(metavar="M", help="Distance in metres from the first camera to the last; see next."),
+        typer.Option(metavar="M", help="Distance in metres from the first camera to the last, or see next."),
     ] = None,
     baseline_between: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="T1 T2", help="Seconds of the sequence that --baseline-m is between."),
+        typer.Option(metavar="T1 T2", help="Timestamps --baseline-m is between: seconds, as in rgb.txt."),
     ] = None,
     odometry: Annotated[
         str | None,
@@ -72,7 +75,7 @@ def run_command(
         float | None, typer.Option(metavar="M", help="Edge of the mesh's voxels in metres. Default: 0.02")
     ] = None,
     device: Annotated[
-        str | None, typer.Option(metavar="cpu|cuda", help="Where networks run. Default: cpu")
+        str | None, typer.Option(metavar="cpu|cuda", help="Where the network runs. Default: cpu")
     ] = None,
     seed: Annotated[
         int | None, typer.Option(metavar="N", help="Seed of everything random. Default: 0")

@@ -58,7 +58,8 @@ def scale_command(
     from slamdepth.depth.registry import create_depth_model
     from slamdepth.depth.scale import check_can_fit, fit_scale
     from slamdepth.depth.scale_file import write_scale
-    from slamdepth.errors import DatasetError, OutputError
+    from slamdepth.errors import DatasetError
+    from slamdepth.pipeline.folder import writable_file
     from slamdepth.pipeline.prediction_scale import read_with_depth
     from slamdepth.report import scale_table
 
@@ -68,8 +69,8 @@ def scale_command(
             f"{sequence}: has no sensor depth to fit a scale to; 'slamdepth run SEQ --depth-scale "
             "groundtruth' can take one from a ground truth trajectory"
         )
-    if output is not None and (output.is_dir() or not output.absolute().parent.is_dir()):
-        raise OutputError(f"{output}: cannot be written: name a file in a folder that exists")
+    if output is not None:
+        output = writable_file(output, ".yaml")
     model = create_depth_model(depth, device=device, weights=depth_weights)
     check_can_fit(model, shift)
     err = error_console()

@@ -33,6 +33,8 @@ def train_depth_command(
 
     A training or search that was killed goes on where it stopped, to the same result.
 
+    Data folders that are not absolute lie below $SLAMDEPTH_DATA.
+
     Loss curves, sample predictions and figures go into a folder beside the head.
     """
     show_log()

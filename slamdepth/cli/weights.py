@@ -9,7 +9,9 @@ import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
 
-app = typer.Typer(help="List and fetch network weights.", no_args_is_help=True)
+app = typer.Typer(
+    help="List and fetch network weights.\n\nExample: slamdepth weights pull", no_args_is_help=True
+)
 
 
 @app.command("list")

@@ -85,7 +85,10 @@ def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dat
         if not path.exists():
             raise DatasetError(f"{path}: no such folder")
         if not path.is_dir():
-            raise DatasetError(f"{path}: is a file; a sequence is a folder")
+            raise DatasetError(
+                f"{path}: is a file; a sequence is a folder (of a video: its frames and rgb.txt, "
+                "see 'Your own video' in the README)"
+            )
         camera = None if camera_file is None else read_camera(Path(camera_file).expanduser())
         readers = known_readers()
         for reader in readers:

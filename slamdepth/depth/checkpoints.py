@@ -34,7 +34,10 @@ def find_checkpoint(model: str, file_names: Sequence[str], given: str | Path | N
         if (folder / name).is_file():
             return folder / name
     either = " or ".join(file_names)
-    raise WeightsError(f"depth model '{model}' has no weights: put {either} into {folder}, or name the file")
+    raise WeightsError(
+        f"depth model '{model}' has no weights: put {either} into {folder}, "
+        "or name the file (--depth-weights)"
+    )
 
 
 def read_checkpoint(path: Path) -> dict[str, Tensor]:

@@ -27,9 +27,11 @@ def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
         camera: a ``camera.yaml`` for a sequence.
 
     Raises:
-        DatasetError: the folder is missing, of no known kind, malformed, or has no depth.
+        DatasetError: the folder is missing, a file, of no known kind, malformed, or has no depth.
         CameraError: the intrinsics of a sequence are unknown or malformed.
     """
+    if path.is_file():
+        raise DatasetError(f"{path}: is a file; name a folder of images with depth")
     folder = data_folder(str(path))
     readers = known_readers().values()
 

@@ -142,6 +142,26 @@ def _is_run(path: Path) -> bool:
         return False
 
 
+def writable_file(path: Path, ending: str) -> Path:
+    """``path``, if a file can be written there without replacing one of another kind.
+
+    Asked before the work, so that none is lost. A file of an earlier call (same ``ending``,
+    such as ``.json``) may be replaced; one that a user mixed up with it may not.
+
+    Raises:
+        OutputError: it is a folder or another kind of file, or its folder is missing or
+            cannot be written.
+    """
+    path = path.expanduser()
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; name a file for the results")
+    if path.exists() and path.suffix.lower() != ending:
+        raise OutputError(f"{path}: is there already and no {ending} file; name another file")
+    if path.parent.exists():
+        return writable(path)
+    raise OutputError(f"{path.parent}: no such folder to write to; make it first")
+
+
 def writable(path: Path) -> Path:
     """``path``, if it or the nearest folder above it that exists can be written."""
     place = path.absolute()

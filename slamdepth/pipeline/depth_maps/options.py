@@ -50,7 +50,7 @@ class DepthMapOptions:
             near, far = self.colour_range
             if not (0 <= near < far < float("inf")):
                 raise ConfigError(
-                    f"the range of colours must rise from near to far, got {near:g} to {far:g} m"
+                    f"the range of colours must rise from near (0 or more) to far, got {near:g} to {far:g} m"
                 )
 
 
