@@ -148,7 +148,8 @@ def data_folder(named: str) -> Path:
     if not path.is_absolute() and root and not path.is_dir():
         path = Path(root) / path
     if not path.is_dir():
-        raise DatasetError(f"{path}: no such folder (is SLAMDEPTH_DATA set?)")
+        hint = "looked below SLAMDEPTH_DATA" if root else "set SLAMDEPTH_DATA, or name it from here"
+        raise DatasetError(f"{path}: no such folder of images with depth ({hint})")
     return path
 
 
