@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # benchmarks is not installed
-
 from benchmarks import tables
 from benchmarks.depth_cache import DepthCache
 from benchmarks.jobs import Job, run_job
