@@ -15,6 +15,7 @@ from slamdepth.depth.head import UPSAMPLING, load_head
 from slamdepth.depth.training import loop
 from slamdepth.depth.training.config import TrainConfig
 from slamdepth.depth.training.features import FeatureCache
+from slamdepth.depth.training.plan import plan_training
 from slamdepth.errors import ConfigError
 
 
@@ -72,3 +73,9 @@ def test_fine_epochs_train_the_upsampling_alone(settings: dict[str, Any]) -> Non
     }
     assert changed
     assert all(name.split(".", 2)[2].startswith(UPSAMPLING) for name in changed)
+
+
+def test_a_plan_counts_the_steps_of_each_member(settings: dict[str, Any]) -> None:
+    config = TrainConfig.from_dict({**settings, "sources": settings["sources"][:2]})
+    plan = plan_training(config, backbone=tiny_backbone())
+    assert plan.steps == 2 * (1 + 1)  # two epochs; 4 views of its own are one batch of each member

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2
@@ -17,6 +18,7 @@ from slamdepth.depth.training.views import Partner, SampleKey, plan_plain, plan_
 from slamdepth.errors import ConfigError
 
 _JUDGED_VIEWS = 50
+_T = TypeVar("_T")
 _VIEW_VERSION = 3
 """Counts up where the same settings make other views or features."""
 
@@ -119,11 +121,11 @@ def _teaches(members: tuple[int, ...] | None, member: int) -> bool:
     return members is None or member in members
 
 
-def of_member(planned: list[PlannedCache], caches: list[FeatureCache], member: int) -> list[FeatureCache]:
-    """The caches that ``member`` is trained on."""
+def of_member(planned: Sequence[PlannedCache], each: Sequence[_T], member: int) -> list[_T]:
+    """Of what there is ``each`` planned cache, what belongs to those that ``member`` is trained on."""
     return [
-        cache
-        for plan, cache in zip(planned, caches, strict=True)
+        one
+        for plan, one in zip(planned, each, strict=True)
         if plan.held_out is None and _teaches(plan.members, member)
     ]
 

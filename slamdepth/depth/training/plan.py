@@ -13,10 +13,10 @@ import torch
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.checkpoints import check_device
-from slamdepth.depth.dinov2 import DinoV2, load_dinov2
+from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
 from slamdepth.depth.head import DepthHead, HeadShape
 from slamdepth.depth.preprocess import PATCH
-from slamdepth.depth.training.caches import benchmarks_seen, plan_caches
+from slamdepth.depth.training.caches import benchmarks_seen, of_member, plan_caches
 from slamdepth.depth.training.config import TrainConfig
 from slamdepth.depth.training.data import PlaceReader
 from slamdepth.depth.training.features import encode, sample_specs
@@ -87,7 +87,7 @@ def plan_training(
         try:
             file = store.find_backbone(config.backbone)
             backbone_sha256 = store.verify(file)
-            backbone = load_dinov2(file, device)
+            backbone = load_dinov2(file, device).to(working_type(device))
         except WeightsError as error:
             missing = str(error)
     planned = plan_caches(config, backbone_sha256, readers)
@@ -105,19 +105,19 @@ def plan_training(
         )
         for plan in planned
     )
-    samples = sum(source.samples for source in sources if not source.is_held_out)
-    steps = steps_per_epoch(config, samples)
+    steps = sum(
+        steps_per_epoch(config, sum(len(plan.keys) for plan in of_member(planned, planned, member)))
+        for member in range(config.members)
+    )
     features_s = training_s = None
     if backbone is not None:
         todo = sum(source.samples - source.cached for source in sources)
         features_s = todo * _view_s(config, backbone, device) if todo else 0.0
         coarse_s, fine_s = _step_s(config, dim, patch, device)
         epoch_s = config.coarse_epochs * coarse_s + config.fine_epochs * fine_s
-        training_s = config.members * steps * epoch_s
+        training_s = steps * epoch_s
     epochs = config.coarse_epochs + config.fine_epochs
-    return TrainingPlan(
-        sources, config.members * epochs * steps, features_s, training_s, missing, benchmarks_seen(planned)
-    )
+    return TrainingPlan(sources, epochs * steps, features_s, training_s, missing, benchmarks_seen(planned))
 
 
 def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:
