@@ -49,6 +49,18 @@ class TrackingConfig(_Section):
     )
 
 
+class ShutterConfig(_Section):
+    """The camera's shutter, which reads most cameras' images row by row."""
+
+    readout_ms: float | None = Field(
+        None,
+        ge=-50,
+        le=50,
+        description="milliseconds from an image's first row to its last; 0 for a global shutter, null to "
+        "find it out",
+    )
+
+
 class BundleConfig(_Section):
     """Local and global bundle adjustment."""
 
@@ -154,6 +166,7 @@ class Config(_Section):
     odometry: Literal["orb", "kiss-icp"] = Field("orb", description="what estimates the motion")
     features: FeatureConfig = FeatureConfig()
     tracking: TrackingConfig = TrackingConfig()
+    shutter: ShutterConfig = ShutterConfig()
     bundle: BundleConfig = BundleConfig()
     loops: LoopConfig = LoopConfig()
     depth: DepthConfig = DepthConfig()

@@ -7,6 +7,8 @@ Minimises, over poses, points and one log scale ``a_k`` per keyframe,
        + sum  rho_c((log z_kp - a_k - log d_kp)^2 / t_kp^2)   depth prior, Cauchy
        + sum  a_k^2 / s_a^2                                   a keyframe's common depth error
 
+and, where the shutter may roll, over the readout time ``r`` common to all images, which
+moves a pixel ``u`` by ``r du/dr`` (``BundleProblem.px_rate``);
 by Levenberg-Marquardt with the points eliminated (Schur complement; Triggs et al.,
 "Bundle Adjustment: A Modern Synthesis", 1999). A predicted depth errs mostly in
 common over a whole image, which is what ``a_k`` takes up: without it a hundred pixels
@@ -49,6 +51,8 @@ class BundleProblem:
         px: ``(M, 2)``; sigma_px: ``(M,)``.
         log_depth: ``(M,)`` log of the depth prior in metres of the map, NaN where none;
             sigma_log: ``(M,)`` its deviation.
+        px_rate: ``(M, 2)`` pixels by which a second of readout time moves each measurement;
+            None leaves the readout time alone.
         sigma_scale: deviation ``s_a`` of a keyframe's common log depth error; 0 pins
             the scales (sensor depth).
     """
@@ -64,6 +68,7 @@ class BundleProblem:
     log_depth: Floats
     sigma_log: Floats
     sigma_scale: float = 0.0
+    px_rate: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,8 @@ class BundleResult:
         chi2: ``(M,)`` squared whitened pixel residuals.
         initial_cost, final_cost: robust cost of the first phase's start and the end.
         iterations: steps taken.
+        readout_s: what was added to the readout time; readout_sigma_s: its deviation, None
+            where it was left alone.
     """
 
     T_camera_world: Floats
@@ -88,6 +95,8 @@ class BundleResult:
     initial_cost: float
     final_cost: float
     iterations: int
+    readout_s: float = 0.0
+    readout_sigma_s: float | None = None
 
 
 def bundle_adjust(
@@ -126,6 +135,8 @@ def bundle_adjust(
         initial_cost=float(first_cost or 0.0),
         final_cost=cost,
         iterations=steps,
+        readout_s=state.readout_s,
+        readout_sigma_s=None if problem.px_rate is None else solver.readout_sigma_s(state),
     )
 
 
@@ -136,5 +147,8 @@ def _pixel_chi2(problem: BundleProblem, state: State) -> Floats:
     camera = problem.camera
     du = camera.fx * P[:, 0] / z + camera.cx - problem.px[:, 0]
     dv = camera.fy * P[:, 1] / z + camera.cy - problem.px[:, 1]
+    if problem.px_rate is not None:
+        du = du - state.readout_s * problem.px_rate[:, 0]
+        dv = dv - state.readout_s * problem.px_rate[:, 1]
     chi2 = (du * du + dv * dv) / problem.sigma_px**2
     return np.where(P[:, 2] > MIN_DEPTH_M, chi2, np.inf)

@@ -36,11 +36,25 @@ _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True)
 class State:
-    """Poses ``T (K, 4, 4)`` camera from world, points ``X (P, 3)``, log scales ``a (K,)``."""
+    """Poses ``T (K, 4, 4)`` camera from world, points ``X (P, 3)``, log scales ``a (K,)``, readout in s."""
 
     T: Floats
     X: Floats
     a: Floats
+    readout_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Border:
+    """What the readout time, common to all cameras, adds to the normal equations.
+
+    ``Hrp (3, P)``, ``Hrc (K, 7)``, and the numbers ``Hrr`` and ``br``.
+    """
+
+    Hrp: Floats
+    Hrc: Floats
+    Hrr: float
+    br: float
 
 
 @dataclass(frozen=True)
@@ -52,6 +66,7 @@ class _System:
     Hcc: Floats
     bc: Floats
     Hcp: Floats
+    border: _Border | None = None
 
 
 class Solver:
@@ -63,6 +78,7 @@ class Solver:
         index = index[np.argsort(problem.obs_camera[index], kind="stable")]
         self.cam, self.pt = problem.obs_camera[index], problem.obs_point[index]
         self.px, self.inv_sigma_px = problem.px[index].T.copy(), 1.0 / problem.sigma_px[index]
+        self.px_rate = None if problem.px_rate is None else problem.px_rate[index].T.copy()
         has = np.isfinite(problem.log_depth[index])
         self.log_depth = np.where(has, problem.log_depth[index], 0.0)
         self.inv_sigma_log = np.where(has, 1.0 / np.where(has, problem.sigma_log[index], 1.0), 0.0)
@@ -113,6 +129,8 @@ class Solver:
         r = np.empty_like(P)
         r[0] = (camera.fx * P[0] / P[2] + (camera.cx - self.px[0])) * self.inv_sigma_px
         r[1] = (camera.fy * P[1] / P[2] + (camera.cy - self.px[1])) * self.inv_sigma_px
+        if self.px_rate is not None:
+            r[:2] -= state.readout_s * self.px_rate * self.inv_sigma_px
         r[2] = (np.log(P[2]) - state.a[self.cam] - self.log_depth) * self.inv_sigma_log
         weight = np.empty((2, P.shape[1]))
         weight[0] = HUBER / np.maximum(np.sqrt(r[0] * r[0] + r[1] * r[1]), HUBER)
@@ -173,6 +191,8 @@ class Solver:
             Jc[6, 2] = -A[4] * z
         Hcc = np.zeros((self.K, _CAM, _CAM))
         bc = np.zeros((self.K, _CAM))
+        Jr = None if self.px_rate is None else -self.px_rate * (np.sqrt(weight[0]) * self.inv_sigma_px)
+        Hrc = np.zeros((self.K, _CAM))
         for slot, camera in enumerate(self.free.tolist()):
             block = self.blocks[camera]
             if self.pinned[slot]:
@@ -180,41 +200,88 @@ class Solver:
             flat = Jc[:, :, block].reshape(_CAM, -1)
             Hcc[slot] = flat @ flat.T
             bc[slot] = flat @ b[:, block].ravel()
+            if Jr is not None:
+                Hrc[slot] = np.einsum("irn,rn->i", Jc[:, :2, block], Jr[:, block])
         Hcc[np.flatnonzero(self.pinned)[:, None], np.arange(6), np.arange(6)] += 1.0
         if sigma_scale > 0:
             Hcc[:, 6, 6] += 1.0 / sigma_scale**2
             bc[:, 6] += state.a[self.free] / sigma_scale**2
         else:
             Hcc[:, 6, 6] += 1.0
-        return _System(Hpp, bp, Hcc, bc, np.einsum("irn,rjn->ijn", Jc, Jp))
+        border = None
+        if Jr is not None:
+            Hrp = np.stack([self._by_point((Jp[:2, i] * Jr).sum(axis=0)) for i in range(3)])
+            border = _Border(Hrp, Hrc, float((Jr * Jr).sum()), float((Jr * b[:2]).sum()))
+        return _System(Hpp, bp, Hcc, bc, np.einsum("irn,rjn->ijn", Jc, Jp), border)
 
     def _step(self, state: State, system: _System, damping: float) -> State:
         M = _inverse_factor(system.Hpp, damping)
         Z = _times_transposed(system.Hcp, M[:, self.pt])
         y = _times(M, system.bp)
+        reduced, rhs = self._reduced(system, Z, y, damping)
+        pull = y
+        delta_r = 0.0
+        if system.border is None:
+            delta_c = -_solve_positive(reduced, rhs)
+        else:
+            w = _times(M, system.border.Hrp)
+            delta = -_solve_positive(*self._bordered(system.border, reduced, rhs, Z, y, w))
+            delta_c, delta_r = delta[:-1], float(delta[-1])
+            pull = y + w * delta_r
+        delta_c = delta_c.reshape(self.K, _CAM)
+        back = np.zeros((3, len(self.pt)))
+        for slot, camera in enumerate(self.free.tolist()):
+            block = self.blocks[camera]
+            back[:, block] = np.einsum("ijn,i->jn", Z[:, :, block], delta_c[slot])
+        delta_p = -_transposed_times(M, pull + np.stack([self._by_point(row) for row in back]))
+        T, a = state.T.copy(), state.a.copy()
+        T[self.free] = se3_exp(delta_c[:, :6]) @ T[self.free]
+        if self.problem.sigma_scale > 0:
+            a[self.free] += delta_c[:, 6]
+        return State(T, state.X + delta_p.T, a, state.readout_s + delta_r)
+
+    def _reduced(self, system: _System, Z: Floats, y: Floats, damping: float) -> tuple[Floats, Floats]:
+        """The camera system ``(7 K, 7 K)``, ``(7 K,)`` that is left when the points are eliminated."""
         S, rhs = np.zeros((self.K, _CAM, self.K, _CAM)), system.bc.copy()
         damped = system.Hcc.copy()
         diagonal = np.arange(_CAM)
         damped[:, diagonal, diagonal] += damping * system.Hcc[:, diagonal, diagonal] + 1e-6
         each = np.arange(self.K)
         S[each, :, each] = damped
-        y_seen = y[:, self.pt]
-        for slot, camera in enumerate(self.free.tolist()):
-            block = self.blocks[camera]
-            rhs[slot] -= np.einsum("ijn,jn->i", Z[:, :, block], y_seen[:, block])
+        rhs -= self._seen_by_cameras(Z, y)
         size = self.K * _CAM
-        reduced = S.reshape(size, size) - self._coupling(Z)
-        delta_c = -_solve_positive(reduced, rhs.ravel()).reshape(self.K, _CAM)
-        back = np.zeros((3, len(self.pt)))
+        return S.reshape(size, size) - self._coupling(Z), rhs.ravel()
+
+    def _bordered(
+        self, border: _Border, reduced: Floats, rhs: Floats, Z: Floats, y: Floats, w: Floats
+    ) -> tuple[Floats, Floats]:
+        """The same with the readout time as last row and column; ``w (3, P)`` is its eliminated part."""
+        column = (border.Hrc - self._seen_by_cameras(Z, w)).ravel()
+        corner = border.Hrr - float((w * w).sum()) + 1e-6
+        S = np.block([[reduced, column[:, None]], [column[None], np.array([[corner]])]])
+        return S, np.append(rhs, border.br - float((w * y).sum()))
+
+    def _seen_by_cameras(self, Z: Floats, v: Floats) -> Floats:
+        """``Z v`` for a value ``(3, P)`` of each point, ``(K, 7)``."""
+        seen = v[:, self.pt]
+        out = np.zeros((self.K, _CAM))
         for slot, camera in enumerate(self.free.tolist()):
             block = self.blocks[camera]
-            back[:, block] = np.einsum("ijn,i->jn", Z[:, :, block], delta_c[slot])
-        delta_p = -_transposed_times(M, y + np.stack([self._by_point(row) for row in back]))
-        T, a = state.T.copy(), state.a.copy()
-        T[self.free] = se3_exp(delta_c[:, :6]) @ T[self.free]
-        if self.problem.sigma_scale > 0:
-            a[self.free] += delta_c[:, 6]
-        return State(T, state.X + delta_p.T, a)
+            out[slot] = np.einsum("ijn,jn->i", Z[:, :, block], seen[:, block])
+        return out
+
+    def readout_sigma_s(self, state: State) -> float:
+        """Deviation of the readout time, all poses and points being free."""
+        system = self._linearise(state, *self._residual(state))
+        assert system.border is not None
+        M = _inverse_factor(system.Hpp, 0.0)
+        Z = _times_transposed(system.Hcp, M[:, self.pt])
+        y = np.zeros((3, self.P))
+        reduced, rhs = self._reduced(system, Z, y, 0.0)
+        S, _ = self._bordered(system.border, reduced, rhs, Z, y, _times(M, system.border.Hrp))
+        unit = np.zeros(len(S))
+        unit[-1] = 1.0
+        return float(np.sqrt(max(_solve_positive(S, unit)[-1], 0.0)))
 
     def _coupling(self, Z: Floats) -> Floats:
         """``Z Z^T`` over all points, ``(7 K, 7 K)``."""

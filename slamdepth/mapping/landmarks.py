@@ -8,7 +8,7 @@ points there through ``alias``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +34,7 @@ class MapKeyframe:
         point_ids: ``(N,)`` row of the map point each keypoint sees, -1 for none.
         log_depth, sigma_log: ``(N,)`` depth prior of each keypoint in metres of the
             map, NaN where it has none.
+        velocity: ``(6,)`` m/s and rad/s in the camera's own axes when it was taken.
     """
 
     id: int
@@ -45,6 +46,7 @@ class MapKeyframe:
     sigma_log: Floats
     prediction: DepthPrediction | None = None
     scale: float = 1.0
+    velocity: Floats = field(default_factory=lambda: np.zeros(6))
 
     @property
     def center_w(self) -> Floats:

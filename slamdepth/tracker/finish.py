@@ -16,6 +16,7 @@ from slamdepth.geometry import invert, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
+from slamdepth.tracker.shutter import Shutter
 from slamdepth.types import Keyframe, Reconstruction
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ _MAX_KEYFRAMES = 600  # beyond, the reduced camera system outgrows a laptop's me
 
 
 def optimise_everything(
-    landmarks: LandmarkMap, mapper: LocalMapper, frames: FrameLog, config: Config
+    landmarks: LandmarkMap, mapper: LocalMapper, frames: FrameLog, shutter: Shutter, config: Config
 ) -> tuple[list[str], tuple[float, ...]]:
     """Global bundle adjustment and metric scale.
 
@@ -43,7 +44,14 @@ def optimise_everything(
         rows = np.flatnonzero(
             landmarks.alive[: landmarks.size] & (landmarks.observations[: landmarks.size] >= 2)
         )
-        mapper.adjust([k.id for k in keyframes], [], rows, (5, 8))
+        _follow_motion(landmarks, frames, shutter)
+        result = mapper.adjust([k.id for k in keyframes], [], rows, (5, 8), find_readout=shutter.is_sought)
+        if result is not None and result.readout_sigma_s is not None:
+            shutter.learn(result.readout_s, result.readout_sigma_s)
+        if shutter.rolls:
+            _follow_motion(landmarks, frames, shutter)
+            rows = rows[landmarks.alive[rows] & (landmarks.observations[rows] >= 2)]
+            mapper.adjust([k.id for k in keyframes], [], rows, (3, 3))
     elif len(keyframes) > _MAX_KEYFRAMES:
         notes.append(
             f"the final adjustment of the whole map was left out: {len(keyframes)} keyframes, "
@@ -53,6 +61,14 @@ def optimise_everything(
     if prediction is not None and not prediction.is_sensor:
         votes = _make_metric(landmarks, frames)
     return notes, votes
+
+
+def _follow_motion(landmarks: LandmarkMap, frames: FrameLog, shutter: Shutter) -> None:
+    """Correct all keyframes for the shutter by velocities of the whole trajectory."""
+    frames.refresh_velocities()
+    if shutter.rolls:
+        for keyframe in landmarks.keyframes:
+            shutter.correct_keyframe(keyframe)
 
 
 def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> tuple[float, ...]:
@@ -98,6 +114,7 @@ def build_reconstruction(
     landmarks: LandmarkMap,
     mapper: LocalMapper,
     frames: FrameLog,
+    shutter: Shutter,
     *,
     refine_frames: bool,
     frames_total: int,
@@ -113,7 +130,7 @@ def build_reconstruction(
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         making = [pool.submit(_final, keyframe, mapper) for keyframe in landmarks.keyframes]
         if refine_frames:
-            frames.refine()
+            frames.refine(shutter.readout_s)
         keyframes = tuple(made.result() for made in making)
     good = landmarks.alive[: landmarks.size] & (landmarks.observations[: landmarks.size] >= 2)
     return Reconstruction(

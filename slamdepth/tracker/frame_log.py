@@ -10,7 +10,8 @@ import numpy as np
 
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.pose import refine_pose
-from slamdepth.geometry import invert
+from slamdepth.frontend.rolling_shutter import at_middle_row, row_phase, velocity_between
+from slamdepth.geometry import invert, transform
 from slamdepth.mapping.landmarks import LandmarkMap
 from slamdepth.tracker.localiser import Placement
 from slamdepth.types import Camera, Trajectory
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _MIN_MATCHES = 30
+_MAX_GAP_S = 0.2  # frames farther apart say little of the velocity between them
+_NEAREST_M = 0.05
 _MAX_SHIFT_SHARE = 0.1  # of the scene's distance: a refinement is no relocation
 
 
@@ -32,13 +35,18 @@ class _Placed:
     T_camera_keyframe: NDArray[np.float64]
     rows: NDArray[np.int32]
     px: NDArray[np.float32]
+    phase: NDArray[np.float32]
     sigma_px: NDArray[np.float32]
 
 
 class FrameLog:
-    """Frames relative to their keyframe, with what they saw (kiss-slam's local frames)."""
+    """Frames relative to their keyframe, with what they saw (kiss-slam's local frames).
+
+    Pixels are kept as the shutter took them.
+    """
 
     def __init__(self, camera: Camera, landmarks: LandmarkMap) -> None:
+        self._raw_camera = camera
         self._camera = camera.without_distortion()
         self._map = landmarks
         self._placed: list[_Placed] = []
@@ -47,7 +55,11 @@ class FrameLog:
         return len(self._placed)
 
     def add(self, timestamp_s: float, features: Features, placement: Placement, is_keyframe: bool) -> None:
-        """Remember where a frame is, relative to a keyframe that sees the same."""
+        """Remember where a frame is, relative to a keyframe that sees the same.
+
+        Args:
+            features: as extracted, not yet corrected for a rolling shutter.
+        """
         reference = self._map.keyframes[-1]
         if (
             not is_keyframe
@@ -64,6 +76,7 @@ class FrameLog:
                 placement.T_camera_world @ reference.T_world_camera,
                 placement.point_ids[at].astype(np.int32),
                 features.px[at].astype(np.float32),
+                row_phase(features.raw_px[at], self._raw_camera).astype(np.float32),
                 features.sigma_px[at].astype(np.float32),
             )
         )
@@ -76,14 +89,43 @@ class FrameLog:
     def T_camera_world(self, placed: _Placed) -> Floats:
         return placed.T_camera_keyframe @ self._map.keyframes[placed.keyframe].T_camera_world
 
-    def refine(self) -> None:
+    def velocity_at(self, keyframe: int) -> Floats | None:
+        """Velocity ``(6,)`` of a keyframe, by the frames before and after it; None if it is not there."""
+        for n in range(len(self._placed) - 1, -1, -1):
+            if self._placed[n].is_keyframe and self._placed[n].keyframe == keyframe:
+                return self._velocity(n)
+        return None
+
+    def _velocity(self, n: int) -> Floats:
+        """Central difference over the frames next to the ``n``-th, where they are near in time."""
+        here = self._placed[n].timestamp_s
+        ends = [n]
+        if n > 0 and here - self._placed[n - 1].timestamp_s < _MAX_GAP_S:
+            ends.insert(0, n - 1)
+        if n + 1 < len(self._placed) and self._placed[n + 1].timestamp_s - here < _MAX_GAP_S:
+            ends.append(n + 1)
+        first, last = self._placed[ends[0]], self._placed[ends[-1]]
+        if first is last:
+            return np.zeros(6)
+        return velocity_between(
+            self.T_camera_world(first), self.T_camera_world(last), last.timestamp_s - first.timestamp_s
+        )
+
+    def refresh_velocities(self) -> None:
+        """Tell every keyframe how it moved."""
+        for n, placed in enumerate(self._placed):
+            if placed.is_keyframe:
+                self._map.keyframes[placed.keyframe].velocity = self._velocity(n)
+
+    def refine(self, readout_s: float) -> None:
         """Place every ordinary frame anew in the final map, by what it saw.
 
         A frame was placed when half of its points were young; by the end they are known
         better, and the frame with them (motion-only bundle adjustment).
         """
         landmarks = self._map
-        for placed in self._placed:
+        velocities = [self._velocity(n) for n in range(len(self._placed))] if readout_s else []
+        for n, placed in enumerate(self._placed):
             keyframe = landmarks.keyframes[placed.keyframe]
             if placed.is_keyframe:
                 placed.T_camera_keyframe = np.eye(4)
@@ -95,12 +137,18 @@ class FrameLog:
                 continue
             rows = rows[good]
             start = self.T_camera_world(placed)
+            px = placed.px[good].astype(np.float64)
+            if readout_s:
+                z = transform(start, landmarks.position_w[rows])[:, 2]
+                inverse = 1.0 / np.maximum(z, _NEAREST_M)
+                phase = placed.phase[good].astype(np.float64)
+                px = at_middle_row(self._camera, px, phase, inverse, velocities[n], readout_s)
             estimate = refine_pose(
                 self._camera,
                 start,
                 landmarks.position_w[rows],
                 landmarks.covariance_w[rows],
-                placed.px[good].astype(np.float64),
+                px,
                 placed.sigma_px[good].astype(np.float64),
                 rounds=2,
                 iterations=3,

@@ -24,6 +24,7 @@ from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Placement
 from slamdepth.tracker.loop_closer import LoopCloser
+from slamdepth.tracker.shutter import Shutter
 from slamdepth.tracker.stopwatch import Stopwatch
 from slamdepth.types import Frame
 
@@ -73,6 +74,7 @@ class Keyframes:
         loops: LoopCloser,
         frames: FrameLog,
         depth: DepthThread,
+        shutter: Shutter,
         watch: Stopwatch,
     ) -> None:
         self._config = config
@@ -81,6 +83,7 @@ class Keyframes:
         self._loops = loops
         self._log = frames
         self._depth = depth
+        self._shutter = shutter
         self._timed = watch.timed
         self._reference_overlap = 0.0
         self._still = 0
@@ -118,17 +121,29 @@ class Keyframes:
         turned = float(rotation_angle_rad(D[:3, :3]))
         return float(np.linalg.norm(D[:3, 3])) > _RESCUE_STEP_M or turned > _RESCUE_TURN_RAD
 
-    def make(self, frame: Frame, features: Features, placement: Placement) -> MapKeyframe:
+    def make(
+        self, frame: Frame, features: Features, placement: Placement, velocity: Floats
+    ) -> MapKeyframe:
         """Put a frame into the map; its depth follows ``tracking.depth_delay`` frames later."""
         self._depth.ask(frame)
         with self._timed("mapping"):
-            keyframe = self._mapper.insert(frame, features, placement.T_camera_world, placement.point_ids)
+            keyframe = self._mapper.insert(
+                frame, features, placement.T_camera_world, placement.point_ids, velocity
+            )
         self._reference_overlap, self._still, self._seen_share = 0.0, 0, 1.0
         # the first few are waited for: all that follows stands on the points born there
         at_once = self._depth.is_instant(frame) or len(self._map.keyframes) <= _START_KEYFRAMES
         delay = 0 if at_once else self._config.tracking.depth_delay
         self._waiting = _Waiting(keyframe, delay)
         return keyframe
+
+    def _follow_motion(self, keyframe: MapKeyframe) -> None:
+        """Use that the frames after the keyframe tell how it moved."""
+        velocity = self._log.velocity_at(keyframe.id)
+        if velocity is not None:
+            keyframe.velocity = velocity
+        if self._shutter.rolls:
+            self._shutter.correct_keyframe(keyframe)
 
     @property
     def is_due(self) -> bool:
@@ -154,10 +169,13 @@ class Keyframes:
         with self._timed("depth"):
             prediction = self._depth.take(keyframe.frame)
         with self._timed("mapping"):
+            self._follow_motion(keyframe)
             self._mapper.give_birth(keyframe, prediction)
             self._mapper.search_neighbours(keyframe)
         with self._timed("bundle"):
             self._mapper.adjust_window(keyframe)
+            if self._shutter.is_due(len(self._map.keyframes)):
+                self._mapper.find_readout()
         with self._timed("loops"):
             self._loops.add(keyframe)
             correction = self._loops.close(keyframe)

@@ -20,6 +20,7 @@ from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, invert, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.localiser import Localiser
+from slamdepth.tracker.shutter import Shutter
 from slamdepth.types import Camera, DepthPrediction, Frame
 
 if TYPE_CHECKING:
@@ -29,14 +30,25 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
 
 
+_READOUT_KEYFRAMES = 20
+
+
 class LocalMapper:
     """Grows and refines a :class:`LandmarkMap`, one keyframe at a time."""
 
-    def __init__(self, camera: Camera, config: Config, landmarks: LandmarkMap, localiser: Localiser) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config,
+        landmarks: LandmarkMap,
+        localiser: Localiser,
+        shutter: Shutter,
+    ) -> None:
         self._camera = camera.without_distortion()
         self._config = config
         self._map = landmarks
         self._localiser = localiser
+        self._shutter = shutter
 
     def insert(
         self,
@@ -44,6 +56,7 @@ class LocalMapper:
         features: Features,
         T_camera_world: Floats,
         point_ids: Ints,
+        velocity: Floats,
     ) -> MapKeyframe:
         """Make ``frame`` a keyframe of the map with the points it knows; its depth comes later."""
         keyframe = MapKeyframe(
@@ -54,6 +67,7 @@ class LocalMapper:
             point_ids=point_ids.copy(),
             log_depth=np.full(len(features), np.nan),
             sigma_log=np.full(len(features), np.nan),
+            velocity=velocity,
         )
         self._map.add_keyframe(keyframe)
         return keyframe
@@ -167,8 +181,28 @@ class LocalMapper:
         fixed = [int(k) for k in order if around[k] > 0]
         return self.adjust(window, fixed, rows, (3, 3))
 
+    def find_readout(self) -> None:
+        """Look for the shutter's readout time in the recent keyframes; all follow what is found."""
+        landmarks = self._map
+        last = len(landmarks.keyframes)
+        window = list(range(max(0, last - _READOUT_KEYFRAMES), last))
+        rows = landmarks.points_of(window)
+        rows = rows[landmarks.observations[rows] >= 3]
+        result = self.adjust(window, [], rows, (3, 3), find_readout=True)
+        if result is None or result.readout_sigma_s is None:
+            return
+        if self._shutter.learn(result.readout_s, result.readout_sigma_s):
+            for keyframe in landmarks.keyframes:
+                self._shutter.correct_keyframe(keyframe)
+
     def adjust(
-        self, window: list[int], fixed: list[int], rows: Ints, iterations: tuple[int, ...]
+        self,
+        window: list[int],
+        fixed: list[int],
+        rows: Ints,
+        iterations: tuple[int, ...],
+        *,
+        find_readout: bool = False,
     ) -> BundleResult | None:
         """Bundle adjustment of ``window`` held by ``fixed`` over the points ``rows``; updates the map."""
         landmarks = self._map
@@ -209,6 +243,11 @@ class LocalMapper:
             sigma_log=np.concatenate([k.sigma_log[at] for _, k, at in gather])
             * (1.0 if is_sensor else self._config.bundle.prior_inflation),
             sigma_scale=0.0 if is_sensor else self._config.bundle.scale_sigma,
+            px_rate=(
+                np.concatenate([self._shutter.px_rate(k, at) for _, k, at in gather])
+                if find_readout
+                else None
+            ),
         )
         result = bundle_adjust(problem, iterations)
         self._take_over(keyframes, rows, result)

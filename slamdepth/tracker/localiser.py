@@ -177,6 +177,15 @@ class Localiser:
         self._map.found[placement.point_ids[placement.point_ids >= 0]] += 1
         return placement
 
+    def settle(self, features: Features, placement: Placement) -> Placement:
+        """Place a frame anew by the points it agreed with, after its pixels were corrected."""
+        at = np.flatnonzero(placement.point_ids >= 0)
+        if len(at) < self._config.tracking.min_inliers:
+            return placement
+        rows = placement.point_ids[at]
+        settled = self._solve(features, placement.T_camera_world, rows, at, rounds=2)
+        return settled if settled.inliers >= self._config.tracking.min_inliers else placement
+
     def attach(self, features: Features, placement: Placement, rows: Ints) -> Placement:
         """Find what a frame whose pose is known otherwise sees of the points ``rows``; the pose stays."""
         visible = self.expected(placement.T_camera_world, rows)

@@ -13,6 +13,7 @@ from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.features import Features
+from slamdepth.frontend.rolling_shutter import velocity_between
 from slamdepth.geometry import invert, so3_exp, so3_log
 from slamdepth.mapping.landmarks import LandmarkMap
 from slamdepth.tracker.checks import check_frame, model_for
@@ -25,6 +26,7 @@ from slamdepth.tracker.localiser import Localiser, Placement
 from slamdepth.tracker.loop_closer import LoopCloser
 from slamdepth.tracker.prepare import Preparation, Prepared, load_libraries
 from slamdepth.tracker.rescue import CloudRescue
+from slamdepth.tracker.shutter import Shutter
 from slamdepth.tracker.stopwatch import Stopwatch
 from slamdepth.tracker.threads import one_blas_thread
 from slamdepth.types import (
@@ -77,12 +79,20 @@ class Tracker:
         self._watch = Stopwatch()
         self._map = LandmarkMap()
         self._localiser = Localiser(camera, self.config, self._map)
-        self._mapper = LocalMapper(camera, self.config, self._map, self._localiser)
+        self._shutter = Shutter(camera, self.config.shutter, self._map)
+        self._mapper = LocalMapper(camera, self.config, self._map, self._localiser, self._shutter)
         self._loops = LoopCloser(self.config, self._map, self._localiser)
         self._rescue = CloudRescue(camera, self.config, self._map)
         self._log = FrameLog(camera, self._map)
         self._keyframes = Keyframes(
-            self.config, self._map, self._mapper, self._loops, self._log, self._depth, self._watch
+            self.config,
+            self._map,
+            self._mapper,
+            self._loops,
+            self._log,
+            self._depth,
+            self._shutter,
+            self._watch,
         )
         self._last: Placement | None = None
         self._velocity = np.eye(4)  # T_camera(now)_camera(before)
@@ -122,18 +132,20 @@ class Tracker:
 
     def _step(self, frame: Frame, prepared: Prepared) -> StepResult:
         self._frames += 1
-        features = prepared.features
+        plain = prepared.features
         self._watch.add("features", prepared.took_ms)
         if not self._map.keyframes:
-            return self._start(frame, features)
+            return self._start(frame, plain)
         self._keyframes.count_frame()
         if self._keyframes.is_due:
             self._join()
         with self._watch.timed("tracking"):
+            features = self._still(frame, plain)
             placement, status = self._place(frame, features)
-        if placement is None:
-            self._last = None
-            return self._result(frame, TrackingStatus.LOST, None, False)
+            if placement is None:
+                self._last = None
+                return self._result(frame, TrackingStatus.LOST, None, False)
+            features, placement = self._settle(frame, plain, features, placement)
         is_keyframe = self._keyframes.wants(placement) and self._depth.has_depth(frame)
         if is_keyframe and self._keyframes.is_waiting:
             # the depth that is on its way comes first: one keyframe waits at a time
@@ -145,8 +157,35 @@ class Tracker:
             self._remember_motion(frame, before, placement)
         else:
             self._remember_motion(frame, placement, placement)
-        self._log.add(frame.timestamp_s, features, placement, is_keyframe)
+        self._log.add(frame.timestamp_s, plain, placement, is_keyframe)
         return self._result(frame, status, placement, is_keyframe)
+
+    def _still(self, frame: Frame, plain: Features) -> Features:
+        """Features freed from the rolling shutter by the velocity of the last frames."""
+        if not self._shutter.rolls or self._last is None:
+            return plain
+        T_guess = self._predicted(frame, self._last)
+        near = np.full(len(plain), np.median(self._shutter.inverse_depth(T_guess, self._last.point_ids)))
+        return self._shutter.correct(plain, self._camera_velocity(frame, T_guess), near)
+
+    def _settle(
+        self, frame: Frame, plain: Features, features: Features, placement: Placement
+    ) -> tuple[Features, Placement]:
+        """The same by the velocity of this very frame, and the frame placed by that."""
+        if not self._shutter.rolls or self._last is None:
+            return features, placement
+        T = placement.T_camera_world
+        inverse = self._shutter.inverse_depth(T, placement.point_ids)
+        settled = self._shutter.correct(plain, self._camera_velocity(frame, T), inverse)
+        return settled, self._localiser.settle(settled, placement)
+
+    def _camera_velocity(self, frame: Frame, T_camera_world: Floats) -> Floats:
+        """``(6,)`` m/s and rad/s since the last frame."""
+        if self._last is None:
+            return np.zeros(6)
+        return velocity_between(
+            self._last.T_camera_world, T_camera_world, frame.timestamp_s - self._last_time_s
+        )
 
     def _join(self) -> Moved | None:
         """Let the waiting keyframe have its depth, and follow the map."""
@@ -165,7 +204,8 @@ class Tracker:
             return self._localiser.refine_in_local_map(features, carried) or carried
 
     def _make_keyframe(self, frame: Frame, features: Features, placement: Placement) -> Placement:
-        keyframe = self._keyframes.make(frame, features, placement)
+        velocity = self._camera_velocity(frame, placement.T_camera_world)
+        keyframe = self._keyframes.make(frame, features, placement, velocity)
         if self._keyframes.is_due:
             self._keyframes.join()
         return Placement(keyframe.T_camera_world.copy(), keyframe.point_ids.copy())
@@ -284,11 +324,14 @@ class Tracker:
             self._join()
             self._depth.close()
             with self._watch.timed("final"):
-                notes, votes = optimise_everything(self._map, self._mapper, self._log, self.config)
+                notes, votes = optimise_everything(
+                    self._map, self._mapper, self._log, self._shutter, self.config
+                )
             return build_reconstruction(
                 self._map,
                 self._mapper,
                 self._log,
+                self._shutter,
                 refine_frames=self.config.bundle.final,
                 frames_total=self._frames,
                 loop_closures=self._loops.count,
