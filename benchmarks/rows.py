@@ -87,6 +87,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "no loops": {"loops": {"enabled": False}},
     "no final bundle": {"bundle": {"final": False}},
     "no loops, no final bundle": {"loops": {"enabled": False}, "bundle": {"final": False}},
+    "rolling shutter ignored": {"shutter": {"readout_ms": 0.0}},
     "window 4": {"bundle": {"window": 4}},
     "no prior inflation": {"bundle": {"prior_inflation": 1.0}},
     "prior inflation 5": {"bundle": {"prior_inflation": 5.0}},

@@ -270,6 +270,9 @@ class Reconstruction:
         scale_votes: log ratio of the map's depths to the predicted ones, one for each
             keyframe that could tell; the map's scale is where their median is 0. Empty
             where nothing was voted on, as with a sensor.
+        readout_s: seconds the camera took from an image's first row to its last, as the
+            trajectory was made with; 0 for a global shutter, None where it plays no part.
+        readout_sigma_s: its deviation where it was found out, None where it was given.
     """
 
     trajectory: Trajectory
@@ -283,3 +286,5 @@ class Reconstruction:
     timings_ms: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     scale_votes: tuple[float, ...] = ()
+    readout_s: float | None = None
+    readout_sigma_s: float | None = None

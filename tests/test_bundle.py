@@ -97,6 +97,24 @@ def test_fixed_cameras_stay_and_arguments_are_left_alone() -> None:
         np.testing.assert_array_equal(a, b)
 
 
+def test_the_readout_time_is_found_with_its_doubt() -> None:
+    """Pixels moved by 20 ms of a rolling shutter, each camera's in its own way."""
+    exact = truth()
+    rng = np.random.default_rng(7)
+    speed = rng.normal(0, 300.0, (len(exact.fixed), 2))
+    phase = exact.px[:, 1:] / CAMERA.height - 0.5
+    rate = speed[exact.obs_camera] * phase
+    problem = replace(disturbed(replace(exact, px=exact.px - 0.02 * rate)), px_rate=rate)
+    result = bundle_adjust(problem, iterations=(10, 10))
+    assert result.readout_s == pytest.approx(0.02, abs=1e-6)
+    assert pose_error(result.T_camera_world, exact.T_camera_world) < 1e-6
+    found = [bundle_adjust(noisy(problem, 0.5, seed), (10, 10)) for seed in range(8)]
+    errors = np.array([r.readout_s - 0.02 for r in found])
+    sigma_s = np.array([r.readout_sigma_s for r in found])
+    assert 0.4 < np.sqrt(np.mean((errors / (0.5 * sigma_s)) ** 2)) < 2.0  # sigma_px says 1, noise is 0.5
+    assert bundle_adjust(exact).readout_sigma_s is None
+
+
 def test_all_cameras_fixed_leaves_the_points_to_move() -> None:
     exact = without_depth(replace(truth(), fixed=np.ones(6, dtype=bool)))
     start = replace(exact, points_w=exact.points_w + 0.02)

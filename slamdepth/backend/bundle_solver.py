@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth.backend.point_blocks import inverse_factor, times, times_transposed, transposed_times
 from slamdepth.geometry import se3_exp
 
 if TYPE_CHECKING:
@@ -215,16 +216,16 @@ class Solver:
         return _System(Hpp, bp, Hcc, bc, np.einsum("irn,rjn->ijn", Jc, Jp), border)
 
     def _step(self, state: State, system: _System, damping: float) -> State:
-        M = _inverse_factor(system.Hpp, damping)
-        Z = _times_transposed(system.Hcp, M[:, self.pt])
-        y = _times(M, system.bp)
+        M = inverse_factor(system.Hpp, damping)
+        Z = times_transposed(system.Hcp, M[:, self.pt])
+        y = times(M, system.bp)
         reduced, rhs = self._reduced(system, Z, y, damping)
         pull = y
         delta_r = 0.0
         if system.border is None:
             delta_c = -_solve_positive(reduced, rhs)
         else:
-            w = _times(M, system.border.Hrp)
+            w = times(M, system.border.Hrp)
             delta = -_solve_positive(*self._bordered(system.border, reduced, rhs, Z, y, w))
             delta_c, delta_r = delta[:-1], float(delta[-1])
             pull = y + w * delta_r
@@ -233,7 +234,7 @@ class Solver:
         for slot, camera in enumerate(self.free.tolist()):
             block = self.blocks[camera]
             back[:, block] = np.einsum("ijn,i->jn", Z[:, :, block], delta_c[slot])
-        delta_p = -_transposed_times(M, pull + np.stack([self._by_point(row) for row in back]))
+        delta_p = -transposed_times(M, pull + np.stack([self._by_point(row) for row in back]))
         T, a = state.T.copy(), state.a.copy()
         T[self.free] = se3_exp(delta_c[:, :6]) @ T[self.free]
         if self.problem.sigma_scale > 0:
@@ -274,11 +275,11 @@ class Solver:
         """Deviation of the readout time, all poses and points being free."""
         system = self._linearise(state, *self._residual(state))
         assert system.border is not None
-        M = _inverse_factor(system.Hpp, 0.0)
-        Z = _times_transposed(system.Hcp, M[:, self.pt])
+        M = inverse_factor(system.Hpp, 0.0)
+        Z = times_transposed(system.Hcp, M[:, self.pt])
         y = np.zeros((3, self.P))
         reduced, rhs = self._reduced(system, Z, y, 0.0)
-        S, _ = self._bordered(system.border, reduced, rhs, Z, y, _times(M, system.border.Hrp))
+        S, _ = self._bordered(system.border, reduced, rhs, Z, y, times(M, system.border.Hrp))
         unit = np.zeros(len(S))
         unit[-1] = 1.0
         return float(np.sqrt(max(_solve_positive(S, unit)[-1], 0.0)))
@@ -315,38 +316,6 @@ class Solver:
         for row, (i, j) in zip(Hpp, _SYMMETRIC, strict=True):
             full[:, i, j] = full[:, j, i] = row
         return np.asarray(np.linalg.inv(full + np.eye(3) * 1e-3), dtype=np.float64)
-
-
-def _inverse_factor(H: Floats, damping: float) -> Floats:
-    """``(6, P)`` M, lower triangular by rows, with ``M^T M`` the inverse of the damped ``H``."""
-    h00, h01, h02, h11, h12, h22 = H
-    c00 = np.sqrt(h00 * (1.0 + damping) + 1e-6)
-    c10, c20 = h01 / c00, h02 / c00
-    c11 = np.sqrt(np.maximum(h11 * (1.0 + damping) + 1e-6 - c10 * c10, 1e-12))
-    c21 = (h12 - c20 * c10) / c11
-    c22 = np.sqrt(np.maximum(h22 * (1.0 + damping) + 1e-6 - c20 * c20 - c21 * c21, 1e-12))
-    m00, m11, m22 = 1.0 / c00, 1.0 / c11, 1.0 / c22
-    m10 = -c10 * m00 * m11
-    return np.stack([m00, m10, m11, -(c20 * m00 + c21 * m10) * m22, -c21 * m11 * m22, m22])
-
-
-def _times(M: Floats, v: Floats) -> Floats:
-    """``M v`` for ``(6, P)`` and ``(3, P)``."""
-    return np.stack([M[0] * v[0], M[1] * v[0] + M[2] * v[1], M[3] * v[0] + M[4] * v[1] + M[5] * v[2]])
-
-
-def _transposed_times(M: Floats, v: Floats) -> Floats:
-    """``M^T v``."""
-    return np.stack([M[0] * v[0] + M[1] * v[1] + M[3] * v[2], M[2] * v[1] + M[4] * v[2], M[5] * v[2]])
-
-
-def _times_transposed(B: Floats, M: Floats) -> Floats:
-    """``B M^T`` for ``(C, 3, N)`` and ``(6, N)``."""
-    out = np.empty_like(B)
-    out[:, 0] = B[:, 0] * M[0]
-    out[:, 1] = B[:, 0] * M[1] + B[:, 1] * M[2]
-    out[:, 2] = B[:, 0] * M[3] + B[:, 1] * M[4] + B[:, 2] * M[5]
-    return out
 
 
 def _solve_positive(S: Floats, rhs: Floats) -> Floats:

@@ -65,6 +65,14 @@ def run_command(
         typer.Option(metavar="orb|kiss-icp", help="What estimates the motion. Default: orb"),
     ] = None,
     camera: CameraOption = None,
+    readout_ms: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MS",
+            help="Milliseconds the camera takes from an image's first row to its last (rolling shutter); "
+            "0 for a global shutter. Default: found out from the motion",
+        ),
+    ] = None,
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="YAML file with settings; options here win.")
     ] = None,
@@ -105,6 +113,7 @@ def run_command(
                 "baseline_m": baseline_m,
                 "baseline_between_s": baseline_between,
             },
+            "shutter": {"readout_ms": readout_ms},
             "map": {"voxel_size_m": voxel_size},
         },
     )

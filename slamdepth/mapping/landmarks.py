@@ -220,6 +220,10 @@ class LandmarkMap:
         mask[-1] = False
         return np.flatnonzero(mask[: self.size] & self.alive[: self.size])
 
+    def seen_by(self, keyframes: int) -> Ints:
+        """Rows of the living points that at least so many keyframes see."""
+        return np.flatnonzero(self.alive[: self.size] & (self.observations[: self.size] >= keyframes))
+
     def sigma_along_ray(self, rows: Ints, center_w: Floats) -> Floats:
         """Relative deviation ``(N,)`` of the distance of points from ``center_w`` ``(3,)``."""
         offset = self.position_w[rows] - center_w

@@ -30,6 +30,7 @@ def run_table(summary: dict[str, Any], places: dict[str, str] | None = None) -> 
         ("loop closures", count(summary["loop_closures"])),
         ("relocalisations", count(summary["relocalisations"])),
         ("scale", summary["scale"]["sentence"]),
+        ("rolling shutter", summary["rolling_shutter"]["sentence"]),
     ]
     if summary["skipped_frames"]:
         rows.insert(1, ("images skipped", count(summary["skipped_frames"])))

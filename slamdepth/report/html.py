@@ -154,6 +154,7 @@ def _tracking(data: ReportData, summary: dict[str, Any]) -> str:
         ["loop closures", count(summary["loop_closures"])],
         ["relocalisations after loss", count(summary["relocalisations"])],
         ["rescues by point-cloud registration", count(summary["rescues"])],
+        ["rolling shutter", summary["rolling_shutter"]["sentence"]],
     ]
     strip = plot(
         plots.tracking_plot(data.steps),

@@ -9,6 +9,7 @@ from typing import Any
 from slamdepth.evaluation import DepthScore, TrajectoryScore
 from slamdepth.report.data import ReportData
 from slamdepth.report.environment import hardware, versions
+from slamdepth.report.shutter import shutter_facts
 
 
 def build_summary(data: ReportData) -> dict[str, Any]:
@@ -27,6 +28,7 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         "relocalisations": run.relocalisations,
         "rescues": run.rescues,
         "fps": data.fps,
+        "rolling_shutter": shutter_facts(run, data.config.shutter.readout_ms is not None),
         "timings_ms": dict(run.timings_ms),
         **_trajectory(data.trajectory_score),
         "depth": _depth(data.depth_score),

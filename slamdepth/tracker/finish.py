@@ -16,6 +16,7 @@ from slamdepth.geometry import invert, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
+from slamdepth.tracker.map_adjuster import MapAdjuster
 from slamdepth.tracker.shutter import Shutter
 from slamdepth.types import Keyframe, Reconstruction
 
@@ -26,11 +27,19 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_SEARCHED_AGAIN = 6  # neighbours of each keyframe; twice as many gain nothing measurable
+_PASSES = 3  # after the first adjustment; more than one only while the readout time changes
+_SETTLED_S = 0.002
 _MAX_KEYFRAMES = 600  # beyond, the reduced camera system outgrows a laptop's memory
 
 
 def optimise_everything(
-    landmarks: LandmarkMap, mapper: LocalMapper, frames: FrameLog, shutter: Shutter, config: Config
+    landmarks: LandmarkMap,
+    mapper: LocalMapper,
+    adjuster: MapAdjuster,
+    frames: FrameLog,
+    shutter: Shutter,
+    config: Config,
 ) -> tuple[list[str], tuple[float, ...]]:
     """Global bundle adjustment and metric scale.
 
@@ -41,17 +50,7 @@ def optimise_everything(
     votes: tuple[float, ...] = ()
     keyframes = landmarks.keyframes
     if config.bundle.final and 3 <= len(keyframes) <= _MAX_KEYFRAMES:
-        rows = np.flatnonzero(
-            landmarks.alive[: landmarks.size] & (landmarks.observations[: landmarks.size] >= 2)
-        )
-        _follow_motion(landmarks, frames, shutter)
-        result = mapper.adjust([k.id for k in keyframes], [], rows, (5, 8), find_readout=shutter.is_sought)
-        if result is not None and result.readout_sigma_s is not None:
-            shutter.learn(result.readout_s, result.readout_sigma_s)
-        if shutter.rolls:
-            _follow_motion(landmarks, frames, shutter)
-            rows = rows[landmarks.alive[rows] & (landmarks.observations[rows] >= 2)]
-            mapper.adjust([k.id for k in keyframes], [], rows, (3, 3))
+        _adjust_all(landmarks, mapper, adjuster, frames, shutter)
     elif len(keyframes) > _MAX_KEYFRAMES:
         notes.append(
             f"the final adjustment of the whole map was left out: {len(keyframes)} keyframes, "
@@ -61,6 +60,25 @@ def optimise_everything(
     if prediction is not None and not prediction.is_sensor:
         votes = _make_metric(landmarks, frames)
     return notes, votes
+
+
+def _adjust_all(
+    landmarks: LandmarkMap, mapper: LocalMapper, adjuster: MapAdjuster, frames: FrameLog, shutter: Shutter
+) -> None:
+    """Adjust everything, look again for what the better map predicts to be seen, and adjust once more."""
+    every = [k.id for k in landmarks.keyframes]
+    _follow_motion(landmarks, frames, shutter)
+    adjuster.adjust(every, [], landmarks.seen_by(2), (5, 8))
+    for n in range(_PASSES):
+        before_s = shutter.readout_s
+        if shutter.is_sought:
+            adjuster.find_readout(every)
+        if n > 0 and abs(shutter.readout_s - before_s) < _SETTLED_S:
+            break
+        _follow_motion(landmarks, frames, shutter)
+        for keyframe in landmarks.keyframes:
+            mapper.search_neighbours(keyframe, limit=_SEARCHED_AGAIN)
+        adjuster.adjust(every, [], landmarks.seen_by(2), (5, 8))
 
 
 def _follow_motion(landmarks: LandmarkMap, frames: FrameLog, shutter: Shutter) -> None:
@@ -92,6 +110,7 @@ def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> tuple[float, ...]:
         keyframe.T_camera_world[:3, 3] *= factor
         keyframe.log_depth -= offset
         keyframe.scale *= factor
+        keyframe.velocity[:3] *= factor
     landmarks.refresh_views(np.arange(n))
     frames.rescale(np.full(len(landmarks.keyframes), factor))
     return tuple(float(vote) for vote in votes - offset)
@@ -145,6 +164,8 @@ def build_reconstruction(
         timings_ms=timings_ms,
         notes=tuple(notes),
         scale_votes=scale_votes,
+        readout_s=shutter.readout_s,
+        readout_sigma_s=shutter.sigma_s,
     )
 
 

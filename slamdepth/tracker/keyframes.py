@@ -24,6 +24,7 @@ from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Placement
 from slamdepth.tracker.loop_closer import LoopCloser
+from slamdepth.tracker.map_adjuster import MapAdjuster
 from slamdepth.tracker.shutter import Shutter
 from slamdepth.tracker.stopwatch import Stopwatch
 from slamdepth.types import Frame
@@ -71,6 +72,7 @@ class Keyframes:
         config: Config,
         landmarks: LandmarkMap,
         mapper: LocalMapper,
+        adjuster: MapAdjuster,
         loops: LoopCloser,
         frames: FrameLog,
         depth: DepthThread,
@@ -80,6 +82,7 @@ class Keyframes:
         self._config = config
         self._map = landmarks
         self._mapper = mapper
+        self._adjuster = adjuster
         self._loops = loops
         self._log = frames
         self._depth = depth
@@ -121,9 +124,7 @@ class Keyframes:
         turned = float(rotation_angle_rad(D[:3, :3]))
         return float(np.linalg.norm(D[:3, 3])) > _RESCUE_STEP_M or turned > _RESCUE_TURN_RAD
 
-    def make(
-        self, frame: Frame, features: Features, placement: Placement, velocity: Floats
-    ) -> MapKeyframe:
+    def make(self, frame: Frame, features: Features, placement: Placement, velocity: Floats) -> MapKeyframe:
         """Put a frame into the map; its depth follows ``tracking.depth_delay`` frames later."""
         self._depth.ask(frame)
         with self._timed("mapping"):
@@ -175,7 +176,7 @@ class Keyframes:
         with self._timed("bundle"):
             self._mapper.adjust_window(keyframe)
             if self._shutter.is_due(len(self._map.keyframes)):
-                self._mapper.find_readout()
+                self._adjuster.find_readout()
         with self._timed("loops"):
             self._loops.add(keyframe)
             correction = self._loops.close(keyframe)

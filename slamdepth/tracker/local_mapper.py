@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.backend.bundle import BundleProblem, BundleResult, bundle_adjust
+from slamdepth.backend.bundle import BundleResult
 from slamdepth.config import Config
 from slamdepth.depth.alignment import (
     DepthField,
@@ -17,10 +17,10 @@ from slamdepth.depth.alignment import (
     prior_log_depth_at,
 )
 from slamdepth.frontend.features import Features
-from slamdepth.geometry import backproject, invert, transform
+from slamdepth.geometry import backproject, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.localiser import Localiser
-from slamdepth.tracker.shutter import Shutter
+from slamdepth.tracker.map_adjuster import MapAdjuster
 from slamdepth.types import Camera, DepthPrediction, Frame
 
 if TYPE_CHECKING:
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
-
-
-_READOUT_KEYFRAMES = 20
 
 
 class LocalMapper:
@@ -42,13 +39,13 @@ class LocalMapper:
         config: Config,
         landmarks: LandmarkMap,
         localiser: Localiser,
-        shutter: Shutter,
+        adjuster: MapAdjuster,
     ) -> None:
         self._camera = camera.without_distortion()
         self._config = config
         self._map = landmarks
         self._localiser = localiser
-        self._shutter = shutter
+        self._adjuster = adjuster
 
     def insert(
         self,
@@ -179,103 +176,7 @@ class LocalMapper:
         around[window] = 0
         order = np.argsort(-around, kind="stable")[: config.fixed]
         fixed = [int(k) for k in order if around[k] > 0]
-        return self.adjust(window, fixed, rows, (3, 3))
-
-    def find_readout(self) -> None:
-        """Look for the shutter's readout time in the recent keyframes; all follow what is found."""
-        landmarks = self._map
-        last = len(landmarks.keyframes)
-        window = list(range(max(0, last - _READOUT_KEYFRAMES), last))
-        rows = landmarks.points_of(window)
-        rows = rows[landmarks.observations[rows] >= 3]
-        result = self.adjust(window, [], rows, (3, 3), find_readout=True)
-        if result is None or result.readout_sigma_s is None:
-            return
-        if self._shutter.learn(result.readout_s, result.readout_sigma_s):
-            for keyframe in landmarks.keyframes:
-                self._shutter.correct_keyframe(keyframe)
-
-    def adjust(
-        self,
-        window: list[int],
-        fixed: list[int],
-        rows: Ints,
-        iterations: tuple[int, ...],
-        *,
-        find_readout: bool = False,
-    ) -> BundleResult | None:
-        """Bundle adjustment of ``window`` held by ``fixed`` over the points ``rows``; updates the map."""
-        landmarks = self._map
-        used = sorted(window) + sorted(fixed)
-        index_of = np.full(landmarks.size + 1, -1, dtype=np.int64)
-        index_of[rows] = np.arange(len(rows))
-        index_of[-1] = -1
-        keyframes = [landmarks.keyframes[k] for k in used]
-        cams, feats = [], []
-        for i, k in enumerate(keyframes):
-            at = np.flatnonzero(index_of[k.point_ids] >= 0)
-            cams.append(np.full(len(at), i))
-            feats.append(at)
-        obs_camera, obs_feature = np.concatenate(cams), np.concatenate(feats)
-        if len(obs_camera) < 30:
-            return None
-        obs_point = np.concatenate(
-            [index_of[k.point_ids[at]] for k, at in zip(keyframes, feats, strict=True)]
-        )
-        is_fixed = np.array([k in set(fixed) or k == 0 for k in used])
-        if is_fixed.all():
-            return None
-        if not is_fixed.any():
-            is_fixed[0] = True  # nothing outside holds the window: its oldest keyframe does
-        gather = [(k.features, k, at) for k, at in zip(keyframes, feats, strict=True)]
-        first = landmarks.keyframes[0].prediction
-        is_sensor = first is not None and first.is_sensor
-        problem = BundleProblem(
-            camera=self._camera,
-            T_camera_world=np.stack([k.T_camera_world for k in keyframes]),
-            fixed=is_fixed,
-            points_w=landmarks.position_w[rows].copy(),
-            obs_camera=obs_camera,
-            obs_point=obs_point,
-            px=np.concatenate([f.px[at] for f, _, at in gather]),
-            sigma_px=np.concatenate([f.sigma_px[at] for f, _, at in gather]),
-            log_depth=np.concatenate([k.log_depth[at] for _, k, at in gather]),
-            sigma_log=np.concatenate([k.sigma_log[at] for _, k, at in gather])
-            * (1.0 if is_sensor else self._config.bundle.prior_inflation),
-            sigma_scale=0.0 if is_sensor else self._config.bundle.scale_sigma,
-            px_rate=(
-                np.concatenate([self._shutter.px_rate(k, at) for _, k, at in gather])
-                if find_readout
-                else None
-            ),
-        )
-        result = bundle_adjust(problem, iterations)
-        self._take_over(keyframes, rows, result)
-        bad = ~result.inlier
-        landmarks.drop_observations(np.array(used)[obs_camera[bad]], obs_feature[bad])
-        return result
-
-    def _take_over(self, keyframes: list[MapKeyframe], rows: Ints, result: BundleResult) -> None:
-        landmarks = self._map
-        adjusted = np.zeros(landmarks.size, dtype=bool)
-        adjusted[rows] = True
-        for keyframe, T_new in zip(keyframes, result.T_camera_world, strict=True):
-            if np.array_equal(T_new, keyframe.T_camera_world):
-                continue
-            # points outside the adjustment ride along with the keyframe they were born in
-            riders = np.flatnonzero(
-                (landmarks.birth_keyframe[: landmarks.size] == keyframe.id)
-                & landmarks.alive[: landmarks.size]
-                & ~adjusted
-            )
-            motion = invert(T_new) @ keyframe.T_camera_world
-            landmarks.position_w[riders] = transform(motion, landmarks.position_w[riders])
-            R = motion[:3, :3]
-            landmarks.covariance_w[riders] = R @ landmarks.covariance_w[riders] @ R.T
-            keyframe.T_camera_world = T_new
-        landmarks.position_w[rows] = result.points_w
-        landmarks.covariance_w[rows] = result.covariance_w
-        landmarks.refresh_views(rows)
+        return self._adjuster.adjust(window, fixed, rows, (3, 3))
 
     def cull(self, keyframe: MapKeyframe) -> None:
         """Remove points that are seldom found where they should be."""
@@ -283,9 +184,13 @@ class LocalMapper:
         n = landmarks.size
         age = keyframe.id - landmarks.birth_keyframe[:n]
         seldom = landmarks.found[:n] < 0.25 * landmarks.visible[:n]
+        # a point that several keyframes have found proved itself: what hides it is blur or an obstacle
+        young = (age <= 3) | (landmarks.observations[:n] < 3)
         lonely = (landmarks.observations[:n] < 2) & (age >= 3)
         behind = landmarks.alive[:n] & ~np.isfinite(landmarks.position_w[:n]).all(axis=1)
-        landmarks.kill(np.flatnonzero(landmarks.alive[:n] & ((seldom & (age >= 1)) | lonely | behind)))
+        landmarks.kill(
+            np.flatnonzero(landmarks.alive[:n] & ((seldom & (age >= 1) & young) | lonely | behind))
+        )
 
 
 def _compact(prediction: DepthPrediction) -> DepthPrediction:

@@ -177,6 +177,7 @@ class LoopCloser:
             keyframe.T_camera_world = invert(T_new[k])
             keyframe.log_depth += np.log(scales[k])
             keyframe.scale *= float(scales[k])
+            keyframe.velocity[:3] *= scales[k]
         landmarks.refresh_views(np.arange(landmarks.size))
 
     def _unite(self, keyframe: MapKeyframe, placement: Placement) -> None:

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_FIRST_SEARCH = 10  # keyframes; sought again whenever there are twice as many
+_FIRST_SEARCH = 10  # keyframes; sought again whenever there are half as many more
 _SURE_S = 0.004  # a deviation beyond says nothing yet
 _SIGNIFICANT = 5.0  # deviations from nought; observations are less independent than they claim
-_LONGEST_S = 0.05
+_ABSURD_S = 0.05
 _NEAREST_M = 0.05
 
 
@@ -98,17 +98,19 @@ class Shutter:
         """Whether to look for the readout time now that the map has so many keyframes."""
         if not self.is_sought or keyframes < self._next_search:
             return False
-        self._next_search = 2 * self._next_search
+        self._next_search = keyframes + keyframes // 2
         return True
 
     def learn(self, change_s: float, sigma_s: float) -> bool:
         """Take over what an adjustment found; True where the readout time is another now."""
         found_s = self.readout_s + change_s
-        log.info("rolling shutter: %.1f +- %.1f ms found", 1e3 * found_s, 1e3 * sigma_s)
-        if not sigma_s < _SURE_S or abs(found_s) > _LONGEST_S:
+        log.info("rolling shutter: %.1f +- %.1f ms from first row to last", 1e3 * found_s, 1e3 * sigma_s)
+        if not sigma_s < _SURE_S or abs(found_s) > _ABSURD_S:
             return False
         if abs(found_s) < _SIGNIFICANT * sigma_s:
             found_s = 0.0
+        # no camera reads an image for longer than until the next one
+        found_s = float(np.clip(found_s, -1.0 / self._raw_camera.fps, 1.0 / self._raw_camera.fps))
         changed = found_s != self.readout_s
         self.readout_s, self.sigma_s = found_s, sigma_s
         return changed

@@ -24,6 +24,7 @@ from slamdepth.tracker.keyframes import Keyframes, Moved
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Localiser, Placement
 from slamdepth.tracker.loop_closer import LoopCloser
+from slamdepth.tracker.map_adjuster import MapAdjuster
 from slamdepth.tracker.prepare import Preparation, Prepared, load_libraries
 from slamdepth.tracker.rescue import CloudRescue
 from slamdepth.tracker.shutter import Shutter
@@ -80,7 +81,8 @@ class Tracker:
         self._map = LandmarkMap()
         self._localiser = Localiser(camera, self.config, self._map)
         self._shutter = Shutter(camera, self.config.shutter, self._map)
-        self._mapper = LocalMapper(camera, self.config, self._map, self._localiser, self._shutter)
+        self._adjuster = MapAdjuster(camera, self.config, self._map, self._shutter)
+        self._mapper = LocalMapper(camera, self.config, self._map, self._localiser, self._adjuster)
         self._loops = LoopCloser(self.config, self._map, self._localiser)
         self._rescue = CloudRescue(camera, self.config, self._map)
         self._log = FrameLog(camera, self._map)
@@ -88,6 +90,7 @@ class Tracker:
             self.config,
             self._map,
             self._mapper,
+            self._adjuster,
             self._loops,
             self._log,
             self._depth,
@@ -325,7 +328,7 @@ class Tracker:
             self._depth.close()
             with self._watch.timed("final"):
                 notes, votes = optimise_everything(
-                    self._map, self._mapper, self._log, self._shutter, self.config
+                    self._map, self._mapper, self._adjuster, self._log, self._shutter, self.config
                 )
             return build_reconstruction(
                 self._map,
