@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, invert, project, rotation_angle_rad, se3_exp, so3_exp, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
-from slamdepth.tracker.localiser import Localiser
+from slamdepth.tracker.localiser import Localiser, Placement
 from slamdepth.tracker.loop_closer import Correction, LoopCloser
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
@@ -42,14 +43,38 @@ def true_pose(k: int) -> np.ndarray:
     return T
 
 
-class World:
-    """A map grown along the circle with a drift of pose and scale; metric if ``is_sensor``."""
+def view(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which points of the ring are seen from there, at which pixels ``(N, 2)`` and depths in metres."""
+    px, z = project(CAMERA, transform(invert(T_world_camera), ring()[0]))
+    seen = np.flatnonzero((z > 0.3) & (px > 5).all(1) & (px[:, 0] < 635) & (px[:, 1] < 475))
+    return seen, px[seen], z[seen]
 
-    def __init__(self, count: int, *, turn_drift: float, scale_drift: float, is_sensor: bool) -> None:
+
+class World:
+    """A map grown along the circle with a drift of pose and scale; metric if ``is_sensor``.
+
+    Args:
+        turn_drift, shift_drift_m, scale_drift: radians, metres and share of the scale lost each step.
+        alone: no point is followed from one keyframe to the next, so that each looks for loops.
+        seen_from: keyframes that see, beside their own place, another one's furniture as from this pose.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        *,
+        turn_drift: float = 0.0,
+        shift_drift_m: float = 0.0,
+        scale_drift: float = 0.0,
+        is_sensor: bool,
+        alone: bool = False,
+        seen_from: dict[int, np.ndarray] | None = None,
+    ) -> None:
         self.map = LandmarkMap()
         self.closer = LoopCloser(CONFIG, self.map, Localiser(CAMERA, CONFIG, self.map))
         self._rows: dict[int, int] = {}  # of the points tracked at present
         self._turn_drift, self._scale_drift, self._is_sensor = turn_drift, scale_drift, is_sensor
+        self._shift_drift_m, self._alone, self._seen_from = shift_drift_m, alone, seen_from or {}
         self._true_of: list[int] = []
         self.corrections: list[tuple[int, Correction]] = []
         self._pose = np.eye(4)
@@ -64,20 +89,29 @@ class World:
             step[:3, 3] *= scale
             drift = so3_exp(np.array([0.0, self._turn_drift, 0.0]))
             step[:3, :3] = step[:3, :3] @ drift
+            step[1, 3] += self._shift_drift_m
             self._pose = self.map.keyframes[-1].T_world_camera @ step
-        X, descriptors = ring()
-        P = transform(invert(true_pose(k)), X)
-        px, z = project(CAMERA, P)
-        seen = np.flatnonzero((z > 0.3) & (px > 5).all(1) & (px[:, 0] < 635) & (px[:, 1] < 475))
+        descriptors = ring()[1]
+        seen, px, z = view(true_pose(k))
+        own = np.ones(len(seen), dtype=bool)
+        if k in self._seen_from:  # a third is left of the true place, and none of it is known by sight
+            other, other_px, other_z = view(self._seen_from[k])
+            kept = slice(None, None, 3)
+            seen, px = np.r_[seen[kept], other], np.concatenate([px[kept], other_px])
+            own = np.arange(len(seen)) < len(z[kept])
+            z = np.r_[z[kept], other_z]
         n = len(seen)
-        features = Features(px[seen], px[seen], np.zeros(n, np.int64), np.ones(n), descriptors[seen])
+        features = Features(px, px, np.zeros(n, np.int64), np.ones(n), descriptors[seen])
         keyframe = MapKeyframe(
             id=k,
             frame=Frame(k, float(k), BLANK, CAMERA),
             features=features,
             T_camera_world=invert(self._pose),
-            point_ids=np.array([self._rows.get(int(i), -1) for i in seen], dtype=np.int64),
-            log_depth=np.log(z[seen] * scale),
+            point_ids=np.array(
+                [self._rows.get(int(i), -1) if o else -1 for i, o in zip(seen, own, strict=True)],
+                dtype=np.int64,
+            ),
+            log_depth=np.log(z * scale),
             sigma_log=np.full(n, 0.02),
             prediction=DepthPrediction(
                 np.zeros((480, 640), np.float32), DepthKind.METRIC, None, is_sensor=self._is_sensor
@@ -86,16 +120,21 @@ class World:
         )
         self.map.add_keyframe(keyframe)
         free = np.flatnonzero(keyframe.point_ids < 0)
-        position = transform(self._pose, backproject(CAMERA, px[seen[free]], z[seen[free]] * scale))
+        position = transform(self._pose, backproject(CAMERA, px[free], z[free] * scale))
         rows = self.map.add_points(keyframe, free, position, np.tile(1e-4 * np.eye(3), (len(free), 1, 1)))
-        self._rows = {int(i): int(row) for i, row in zip(seen, keyframe.point_ids, strict=True)}
         assert len(rows) == len(free)
+        seen = seen[own]
+        self._follow(seen, keyframe.point_ids[own])
         self.closer.add(keyframe)
         correction = self.closer.close(keyframe)
         if correction is not None:
             self.corrections.append((k, correction))
-            self._rows = {int(i): int(r) for i, r in zip(seen, keyframe.point_ids, strict=True) if r >= 0}
+            self._follow(seen, keyframe.point_ids[own])
         return correction
+
+    def _follow(self, seen: np.ndarray, rows: np.ndarray) -> None:
+        known = zip(seen.tolist(), rows.tolist(), strict=True)
+        self._rows = {} if self._alone else {i: row for i, row in known if row >= 0}
 
     def position_errors_m(self) -> np.ndarray:
         estimate = np.stack([k.T_world_camera for k in self.map.keyframes])[:, :3, 3]
@@ -149,6 +188,85 @@ def test_a_drift_of_scale_is_closed() -> None:
     correction = world.corrections[0][1].scales
     assert correction[-1] < 0.95
     assert correction[0] == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("is_sensor", [True, False])
+def test_a_large_drift_is_closed_once_three_keyframes_agree(is_sensor: bool) -> None:
+    """20 degrees and half a metre, and predicted depth 1.3 times too large by then."""
+    steps = TURN - 1
+    drift: dict[str, Any] = {
+        "turn_drift": np.deg2rad(20.0) / steps,
+        "shift_drift_m": 0.5 / steps,
+        "scale_drift": 0.0 if is_sensor else 1.3 ** (1 / steps) - 1.0,
+        "is_sensor": is_sensor,
+    }
+    drifted = World(TURN, **drift)
+    assert drifted.closer.count == 0  # one keyframe alone is not believed
+    assert drifted.turn_errors_rad()[-1] > np.deg2rad(19.0)
+    assert drifted.position_errors_m()[-1] > 0.4
+    world = grown_until_a_loop(**drift)
+    assert world.corrections[0][0] == TURN + 1
+    assert world.closer.count == 1
+    assert world.turn_errors_rad().max() < np.deg2rad(4.0)
+    assert world.position_errors_m().max() < 0.1
+    scales = np.array([k.scale for k in world.map.keyframes])
+    np.testing.assert_allclose(scales, 1.0, atol=1e-12 if is_sensor else 0.06)
+    recount_is_right(world.map)
+
+
+def offered(world: World) -> list[tuple[bool, bool]]:
+    """Of each verified loop from here on: whether it is true, and whether it was accepted."""
+    found: list[tuple[bool, bool]] = []
+    correct = world.closer._correct
+
+    def spy(keyframe: MapKeyframe, candidate: int, placement: Placement, scale: float) -> Correction | None:
+        T_loop = world.map.keyframes[candidate].T_camera_world @ invert(placement.T_camera_world)
+        wrong = invert(T_loop) @ invert(true_pose(candidate)) @ true_pose(keyframe.id)
+        made = correct(keyframe, candidate, placement, scale)
+        is_true = rotation_angle_rad(wrong[:3, :3]) < 0.1 and np.linalg.norm(wrong[:3, 3]) < 0.2
+        found.append((bool(is_true), made is not None))
+        return made
+
+    world.closer._correct = spy  # type: ignore[method-assign]
+    return found
+
+
+@pytest.mark.parametrize("turn_drift_deg", [3.0, 20.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_30_percent_false_loops_are_refused(seed: int, turn_drift_deg: float) -> None:
+    """Furniture of one place stands in another too: words agree and so does geometry, through to PnP."""
+    rng = np.random.default_rng(seed)
+    second_turn = np.arange(TURN, 2 * TURN)
+    seen_from = {}
+    for k in rng.choice(second_turn, 6, replace=False):
+        other = true_pose(int(k) + int(rng.integers(4, TURN - 4)))  # 80 to 280 degrees away
+        seen_from[int(k)] = other @ se3_exp(rng.normal(size=6) * [0.2, 0.2, 0.2, 0.1, 0.1, 0.1])
+    world = World(
+        TURN, turn_drift=np.deg2rad(turn_drift_deg) / TURN, is_sensor=False, alone=True, seen_from=seen_from
+    )
+    loops = offered(world)
+    for _ in second_turn:
+        world.grow()
+    false = [accepted for is_true, accepted in loops if not is_true]
+    true = [accepted for is_true, accepted in loops if is_true]
+    assert len(false) >= 6
+    assert len(false) >= 0.3 * len(loops)
+    assert not any(false)
+    assert sum(true) >= 8
+    assert world.turn_errors_rad()[TURN:].max() < np.deg2rad(0.15 * turn_drift_deg + 2.0)
+
+
+def test_false_loops_that_agree_are_refused_where_no_drift_explains_them() -> None:
+    """The same furniture seen again and again from where it cannot be."""
+    aside = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, np.deg2rad(120.0), 0.0]))
+    seen_from = {k: aside @ true_pose(k) for k in range(TURN - 3, TURN + 3)}
+    world = World(TURN - 3, is_sensor=True, alone=True, seen_from=seen_from)
+    loops = offered(world)
+    for _ in range(6):
+        world.grow()
+    assert [is_true for is_true, _ in loops].count(False) >= 5
+    assert not any(accepted for is_true, accepted in loops if not is_true)
+    assert world.position_errors_m().max() < 0.01
 
 
 def test_a_kept_loop_follows_the_metres_of_its_keyframes() -> None:

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.backend.places import PlaceRecogniser
-from slamdepth.backend.pose_graph import Edge, optimise_pose_graph
+from slamdepth.backend.pose_graph import Edge, PoseGraphResult, optimise_pose_graph
 from slamdepth.config import Config
 from slamdepth.geometry import invert, rotation_angle_rad, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.localiser import Localiser, Placement
+from slamdepth.tracker.refused_loops import STEP_SIGMAS, RefusedLoops
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,6 +27,7 @@ log = logging.getLogger(__name__)
 _ALREADY_LINKED = 15  # shared points that make two keyframes neighbours
 _CANDIDATES = 2
 _MIN_SCORE_SHARE = 0.6  # of the likeness of two neighbours in time
+_LOOSER = (2.0, 4.0, 8.0)  # the odometry's deviations, times this, once confirmed loops contradict them
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class LoopCloser:
         self._localiser = localiser
         self.places = PlaceRecogniser()
         self._edges: list[Edge] = []
+        self._refused = RefusedLoops()
         self._last: tuple[int, int] | None = None
         self.count = 0
 
@@ -115,21 +118,43 @@ class LoopCloser:
         other = self._map.keyframes[candidate]
         T_loop = other.T_camera_world @ invert(placement.T_camera_world)
         edge = Edge(candidate, keyframe.id, T_loop, scale, self._sigmas(), is_loop=True)
+        new = [edge]
         scales = np.ones(len(self._map.keyframes))
         if self._is_off(keyframe, placement, scale):
-            edges = [*self._odometry_edges(), *self._edges, edge]
             T_old = np.stack([k.T_world_camera for k in self._map.keyframes])
-            result = optimise_pose_graph(T_old, edges, with_scale=not self._is_metric())
-            if not result.is_inlier[-1]:
+            result = self._optimised(T_old, new)
+            if result is None:
+                new = self._refused.confirmed(edge, T_old, with_scale=not self._is_metric())
+                result = self._optimised_after_drift(T_old, new)
+            if result is None:
+                self._refused.add(edge)
                 log.info("loop %d-%d refused by the pose graph", candidate, keyframe.id)
                 return None
             scales = result.scales
             self._bend(T_old, result.T_world_camera, scales)
-            edge = _rescaled(edge, scales)
+            self._refused.forget()
             self._edges = [_rescaled(e, scales) for e in self._edges]
-        self._edges.append(edge)
+            new = [_rescaled(e, scales) for e in new]
+        self._edges += new
         self._unite(keyframe, placement)
         return Correction(scales)
+
+    def _optimised(self, T_old: Floats, new: list[Edge], looser: float = 1.0) -> PoseGraphResult | None:
+        """The pose graph with the loops ``new``; None where it takes one of them for false."""
+        edges = [*self._odometry_edges(looser), *self._edges, *new]
+        result = optimise_pose_graph(T_old, edges, with_scale=not self._is_metric())
+        return result if result.is_inlier[-len(new) :].all() else None
+
+    def _optimised_after_drift(self, T_old: Floats, confirmed: list[Edge]) -> PoseGraphResult | None:
+        """The same where several loops agree that it is the odometry that errs."""
+        if not confirmed:
+            return None
+        for looser in _LOOSER:
+            result = self._optimised(T_old, confirmed, looser)
+            if result is not None:
+                log.info("%d loops agree on a large drift", len(confirmed))
+                return result
+        return None
 
     def _is_off(self, keyframe: MapKeyframe, placement: Placement, scale: float) -> bool:
         D = placement.T_camera_world @ keyframe.T_world_camera
@@ -139,10 +164,13 @@ class LoopCloser:
     def _sigmas(self) -> tuple[float, float, float]:
         return (0.01, 0.02, 0.03)
 
-    def _odometry_edges(self) -> list[Edge]:
+    def _odometry_edges(self, looser: float = 1.0) -> list[Edge]:
         """Neighbours in time, and every pair that shares many points: what holds the graph's shape.
 
         A keyframe's edges all come from the same observations, so each counts for its share only.
+
+        Args:
+            looser: factor on all deviations.
         """
         keyframes = self._map.keyframes
         edges = []
@@ -153,8 +181,8 @@ class LoopCloser:
                 partners.add(j - 1)
             for i in sorted(partners):
                 T_i_j = keyframes[i].T_camera_world @ keyframe.T_world_camera
-                share = np.sqrt(len(partners))
-                edges.append(Edge(i, j, T_i_j, 1.0, (0.01 * share, 0.02 * share, 0.02 * share)))
+                rotation, translation, log_scale = (s * looser * np.sqrt(len(partners)) for s in STEP_SIGMAS)
+                edges.append(Edge(i, j, T_i_j, 1.0, (rotation, translation, log_scale)))
         return edges
 
     def _bend(self, T_old: Floats, T_new: Floats, scales: Floats) -> None:
