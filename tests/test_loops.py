@@ -356,7 +356,7 @@ def test_no_loop_between_two_places_that_only_look_alike() -> None:
     world.map.add_keyframe(impostor)
     poses = np.stack([k.T_camera_world for k in world.map.keyframes])
     world.closer.add(impostor)
-    assert world.closer._candidates(impostor)[:1] == [0]
+    assert world.closer.candidates(impostor)[:1] == [0]
     assert world.closer.close(impostor) is None
     np.testing.assert_array_equal(np.stack([k.T_camera_world for k in world.map.keyframes]), poses)
 

@@ -36,17 +36,29 @@ CONFIG = Config.from_dict({"features": {"count": 600}})
 Change = Callable[[Frame], Frame]
 
 
-@lru_cache(maxsize=1)
-def walk() -> tuple[tuple[Frame, ...], NDArray[np.float64]]:
-    """All frames with exact depth, and their poses ``(COUNT, 4, 4)`` in the first camera."""
-    frames, poses = zip(*render_frames(SETTINGS, range(COUNT)), strict=True)
+@lru_cache(maxsize=2)
+def walk(*, bare: bool = False) -> tuple[tuple[Frame, ...], NDArray[np.float64]]:
+    """All frames with exact depth, and their poses ``(COUNT, 4, 4)`` in the first camera.
+
+    Args:
+        bare: along the same path through a white room.
+    """
+    settings = SETTINGS.model_copy(update={"texture": "bare"}) if bare else SETTINGS
+    frames, poses = zip(*render_frames(settings, range(COUNT)), strict=True)
     return frames, invert(poses[0]) @ np.stack(poses)
 
 
-def frames(indices: Iterable[int] = range(COUNT), change: Change | None = None) -> list[Frame]:
+def frames(
+    indices: Iterable[int] = range(COUNT), change: Change | None = None, *, bare: bool = False
+) -> list[Frame]:
     """Some frames of the walk, with ``change`` applied to each."""
-    chosen = [walk()[0][i] for i in indices]
+    chosen = [walk(bare=bare)[0][i] for i in indices]
     return chosen if change is None else [change(frame) for frame in chosen]
+
+
+def played(given: Iterable[Frame]) -> list[Frame]:
+    """Frames one after another at the walk's pace, whenever they were taken; ``index`` stays."""
+    return [replace(frame, timestamp_s=k / SETTINGS.fps) for k, frame in enumerate(given)]
 
 
 def colour_only(frame: Frame) -> Frame:
@@ -99,6 +111,14 @@ class Run:
 
     def status_of(self, index: int) -> TrackingStatus:
         return next(r.status for r in self.results if r.index == index)
+
+
+def errors_m(results: Iterable[StepResult]) -> NDArray[np.float64]:
+    """``(N,)`` distances of the placed frames from the truth, the first placed camera aligned."""
+    placed = [(r.index, r.T_world_camera) for r in results if r.T_world_camera is not None]
+    truth = walk()[1][[index for index, _ in placed]]
+    moved = placed[0][1] @ invert(truth[0]) @ truth
+    return np.linalg.norm(moved[:, :3, 3] - np.stack([T for _, T in placed])[:, :3, 3], axis=1)
 
 
 def truth_of(trajectory: Trajectory) -> NDArray[np.float64]:

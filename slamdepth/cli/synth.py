@@ -19,7 +19,7 @@ def synth_command(
     height: Annotated[int | None, typer.Option(metavar="PX", help="Image height. Default: 480")] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Layout, colours, path. Default: 0")] = None,
     texture: Annotated[
-        str | None, typer.Option(metavar="rich|low", help="How much there is to see. Default: rich")
+        str | None, typer.Option(metavar="rich|low|bare", help="How much there is to see. Default: rich")
     ] = None,
     lighting_variation: Annotated[
         float | None, typer.Option(metavar="SHARE", help="Swing of exposure and tint. Default: 0.05")

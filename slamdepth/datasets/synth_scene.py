@@ -33,7 +33,12 @@ class Scene:
 
 
 def build_scene(seed: int, texture: str) -> Scene:
-    """Lay out the room; ``seed`` varies colours, books, pictures and small placements."""
+    """Lay out the room; ``seed`` varies colours, books, pictures and small placements.
+
+    Args:
+        texture: ``"rich"``; ``"low"``, where all contrast is faint; ``"bare"``, a white
+            model of the large furniture, where only light and shape are to be seen.
+    """
     rng = np.random.default_rng([seed, 2])
     surfaces = [
         *_shell(rng), *_window(), *_door(), *furniture.desk(rng), *furniture.bookshelf(rng),
@@ -42,6 +47,13 @@ def build_scene(seed: int, texture: str) -> Scene:
     ]  # fmt: skip
     if texture == "low":
         surfaces = [replace(s, paint=paint.muted(s.paint, 0.15)) if s.emission == 0 else s for s in surfaces]
+    if texture == "bare":
+        surfaces = [
+            *_shell(rng), *_window(), *_door(), *furniture.desk(rng), *furniture.sofa(rng),
+            *furniture.cabinet(rng), *furniture.rug_and_table(rng), *furniture.corners(rng),
+        ]  # fmt: skip
+        white = paint.plain((0.8, 0.8, 0.8), contrast=0.0)
+        surfaces = [replace(s, paint=white) if s.emission == 0 else s for s in surfaces]
     lamps = [
         Lamp((2.5, 2.0, 2.50), (0.22, 0.0, 0.0), (0.0, 0.22, 0.0), (3.0, 2.75, 2.35)),
         Lamp((4.93, 2.0, 1.55), (0.0, 0.65, 0.0), (0.0, 0.0, 0.6), (3.4, 3.7, 4.2)),

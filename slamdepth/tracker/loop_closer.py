@@ -62,8 +62,8 @@ class LoopCloser:
         """Look for a loop at ``keyframe``; on success the map has been corrected."""
         if not self._config.loops.enabled:
             return None
-        for candidate in self._candidates(keyframe):
-            verified = self._verify(keyframe, candidate)
+        for candidate in self.candidates(keyframe):
+            verified = self.verify(keyframe, candidate)
             if verified is None:
                 continue
             placement, scale = verified
@@ -83,7 +83,8 @@ class LoopCloser:
         gap = self._config.loops.min_gap
         return keyframe - self._last[0] > gap or abs(candidate - self._last[1]) > gap
 
-    def _candidates(self, keyframe: MapKeyframe) -> list[int]:
+    def candidates(self, keyframe: MapKeyframe) -> list[int]:
+        """Earlier keyframes that look like ``keyframe`` and share no points with it, best first."""
         newest = keyframe.id - self._config.loops.min_gap
         if newest < 0:
             return []
@@ -93,7 +94,8 @@ class LoopCloser:
         answers = self.places.query_keyframe(keyframe.id, exclude=exclude, top_k=_CANDIDATES)
         return [k for k, score in answers if score >= least]
 
-    def _verify(self, keyframe: MapKeyframe, candidate: int) -> tuple[Placement, float] | None:
+    def verify(self, keyframe: MapKeyframe, candidate: int) -> tuple[Placement, float] | None:
+        """Where ``candidate`` says that ``keyframe`` is, and its metres there; None where it sees another place."""
         placement = self._localiser.from_keyframe(keyframe.features, candidate, minimum=15)
         if placement is None or placement.inliers < self._config.loops.min_inliers:
             return None

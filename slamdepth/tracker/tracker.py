@@ -27,6 +27,7 @@ from slamdepth.tracker.loop_closer import LoopCloser
 from slamdepth.tracker.map_adjuster import MapAdjuster
 from slamdepth.tracker.prepare import Preparation, Prepared, load_libraries
 from slamdepth.tracker.rescue import CloudRescue
+from slamdepth.tracker.retry import Retry
 from slamdepth.tracker.shutter import Shutter
 from slamdepth.tracker.stopwatch import Stopwatch
 from slamdepth.tracker.threads import one_blas_thread
@@ -85,6 +86,7 @@ class Tracker:
         self._mapper = LocalMapper(camera, self.config, self._map, self._localiser, self._adjuster)
         self._loops = LoopCloser(self.config, self._map, self._localiser)
         self._rescue = CloudRescue(camera, self.config, self._map)
+        self._retry = Retry()
         self._log = FrameLog(camera, self._map)
         self._keyframes = Keyframes(
             self.config,
@@ -146,6 +148,8 @@ class Tracker:
             features = self._still(frame, plain)
             placement, status = self._place(frame, features)
             if placement is None:
+                if self._last is not None:
+                    self._retry.start(self._last.T_camera_world, self._velocity)
                 self._last = None
                 return self._result(frame, TrackingStatus.LOST, None, False)
             features, placement = self._settle(frame, plain, features, placement)
@@ -241,7 +245,9 @@ class Tracker:
         )
 
     def _place(self, frame: Frame, features: Features) -> tuple[Placement | None, TrackingStatus]:
-        if self._last is not None:
+        if self._last is None:
+            self._retry.count_frame()
+        else:
             T_guess = self._predicted(frame, self._last)
             rows = self._map.resolve(self._last.point_ids)
             placement = self._localiser.track(features, T_guess, np.unique(rows[rows >= 0]))
@@ -254,12 +260,19 @@ class Tracker:
                 return placement, TrackingStatus.TRACKING
             placement = self._register(frame, features, T_guess)
             if placement is not None:
-                self._rescues += 1
                 return placement, TrackingStatus.RESCUED
         placement = self._relocalise(features)
         if placement is not None:
             self._relocalisations += 1
             return placement, TrackingStatus.RELOCALISED
+        if self._last is None and self._retry.is_due(
+            has_depth=self._depth.has_depth(frame),
+            is_instant=self._depth.is_instant(frame),
+            is_blank=len(features) == 0,
+        ):
+            placement = self._register(frame, features, self._retry.guess(), is_old=True)
+            if placement is not None:
+                return placement, TrackingStatus.RESCUED
         return None, TrackingStatus.LOST
 
     def _predicted(self, frame: Frame, last: Placement) -> Floats:
@@ -285,12 +298,15 @@ class Tracker:
                 return placement
         return None
 
-    def _register(self, frame: Frame, features: Features, T_guess: Floats) -> Placement | None:
+    def _register(
+        self, frame: Frame, features: Features, T_guess: Floats, *, is_old: bool = False
+    ) -> Placement | None:
         if not self._depth.has_depth(frame):
             return None
-        T = self._rescue.place(self._depth_of(frame), T_guess)
+        T = self._rescue.place(self._depth_of(frame), T_guess, is_old=is_old)
         if T is None:
             return None
+        self._rescues += 1
         log.info("frame %d: too few features match; placed by registration of its depth", frame.index)
         empty = Placement(T, np.full(len(features), -1, dtype=np.int64))
         recent = self._map.points_of(

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Place recognition on real sequences: the bag of words, DINOv2, and what the tracker verifies.
+
+    python -m benchmarks.places --data DIR --sequences rgbd_dataset_freiburg1_desk --output places.json
+
+Every frame asks which earlier one shows the same place; true poses and depth say who is right.
+See ``docs/benchmarks.md`` for how to read the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks import places_methods as methods
+from benchmarks.places_scores import score_answers
+from benchmarks.places_truth import labels, overlaps
+from benchmarks.slam import find_sequences, tell
+from benchmarks.summary import FORMAT, environment
+from slamdepth.config import Config
+from slamdepth.datasets import Dataset
+from slamdepth.depth.base import DepthModel
+from slamdepth.depth.registry import create_depth_model
+from slamdepth.depth.sensor import SensorDepth
+from slamdepth.errors import ConfigError, DatasetError, SlamdepthError
+from slamdepth.io import write_json, write_text
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_POSE_WITHIN_S = 0.02
+_TOLERANCE = {"sensor": 0.1, "predicted": 0.3}
+_COLUMNS = (
+    ("average precision", "average_precision", 3),
+    ("recall at 100 % precision", "recall_at_full_precision", 3),
+    ("recall@1", "recall_at_1", 3),
+    ("recall@5", "recall_at_5", 3),
+    ("CPU ms/query", "cpu_ms", 2),
+)
+
+
+def read_places(dataset: Dataset, stride: int, max_frames: int | None, config: Config) -> list[methods.Place]:
+    """Every ``stride``-th frame that has a true pose, with depth, features and, where the backbone is, tokens.
+
+    Raises:
+        DatasetError: there is no ground truth, or fewer than two such frames.
+    """
+    truth = dataset.ground_truth
+    if truth is None:
+        raise DatasetError(f"{dataset.path}: has no ground truth to judge places by")
+    model: DepthModel = SensorDepth() if dataset.has_depth else create_depth_model("dinov2")
+    tokens = _Tokens.load()
+    places = []
+    for index in range(0, min(len(dataset), max_frames or len(dataset)), stride):
+        nearest = int(np.argmin(np.abs(truth.timestamps_s - dataset.timestamps_s[index])))
+        if abs(truth.timestamps_s[nearest] - dataset.timestamps_s[index]) > _POSE_WITHIN_S:
+            continue
+        frame = dataset.read(index, with_depth=dataset.has_depth)
+        if dataset.has_depth and frame.depth_m is None:
+            continue
+        patches, classes = tokens.of(frame.image_rgb) if tokens else ((), ())
+        places.append(
+            methods.Place(
+                frame, methods.features_of(frame, config), model.predict(frame),
+                truth.T_world_camera[nearest], patches, classes,
+            )  # fmt: skip
+        )
+    if len(places) < 2:
+        raise DatasetError(f"{dataset.path}: fewer than two frames have a true pose and depth")
+    return places
+
+
+class _Tokens:
+    """DINOv2's tokens of an image, as a keyframe's depth has them already."""
+
+    def __init__(self, backbone: Any) -> None:
+        from slamdepth.depth.dinov2 import working_type
+
+        self._dtype = working_type("cpu")
+        self._backbone = backbone.to(self._dtype)
+
+    @classmethod
+    def load(cls) -> _Tokens | None:
+        """None, and a line on stderr, where the backbone is not there."""
+        from slamdepth.depth.dinov2 import load_dinov2
+        from slamdepth.depth.weights import find_backbone
+        from slamdepth.errors import WeightsError
+
+        try:
+            return cls(load_dinov2(find_backbone()))
+        except WeightsError as error:
+            tell(f"without DINOv2's rows: {error}")
+            return None
+
+    def of(
+        self, image_rgb: NDArray[np.uint8]
+    ) -> tuple[tuple[methods.Floats, ...], tuple[methods.Floats, ...]]:
+        """Patch tokens ``(P, 384)`` and class token ``(384,)`` after each of the taps, unit length."""
+        import torch
+
+        from slamdepth.depth.preprocess import input_size, normalised, resize_rgb
+
+        rows, columns = input_size(*image_rgb.shape[:2])
+        image = normalised(resize_rgb(image_rgb, rows, columns)[None], "cpu")
+        with torch.inference_mode():
+            tapped = self._backbone(image.to(self._dtype), methods.TAPS)
+        patches = tuple(_unit(grid[0].flatten(1).T.float().numpy()) for grid, _ in tapped)
+        return patches, tuple(_unit(token.float().numpy())[0] for _, token in tapped)
+
+
+def _unit(rows: methods.Floats) -> methods.Floats:
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def earlier_frames(timestamps_s: Sequence[float], apart_s: float) -> dict[int, list[int]]:
+    """Of each frame those that came at least ``apart_s`` before; frames without any are left out."""
+    found = {q: [k for k in range(q) if t - timestamps_s[k] >= apart_s] for q, t in enumerate(timestamps_s)}
+    return {q: frames for q, frames in found.items() if frames}
+
+
+def answerers(
+    places: Sequence[methods.Place], dataset: Dataset, config: Config, min_gap: int
+) -> Iterator[tuple[str, methods.Answer]]:
+    """The rows of the table."""
+    bag = methods.bag_of_words(places)
+    yield "bag of ORB words", bag
+    if places[0].patches:
+        for t, tap in enumerate(methods.TAPS):
+            yield f"DINOv2 class token, block {tap}", methods.vectors([p.classes[t] for p in places])
+        for t, tap in enumerate(methods.TAPS):
+            means = [p.patches[t].mean(axis=0) for p in places]
+            yield f"DINOv2 mean patch token, block {tap}", methods.vectors(means)
+        for t, tap in enumerate(methods.TAPS):
+            again = methods.reranked(places, t, bag, with_bag=False)
+            yield f"bag's first {methods.RERANKED} by DINOv2 patches, block {tap}", again
+        both = methods.reranked(places, 0, bag, with_bag=True)
+        yield f"the same times the bag's score, block {methods.TAPS[0]}", both
+    yield "bag, verified as by the tracker", methods.verified(places, dataset.camera, config, min_gap)
+
+
+def judge(
+    name: str, dataset: Dataset, *, stride: int, max_frames: int | None, apart_s: float
+) -> list[dict[str, Any]]:
+    """The rows of one sequence."""
+    config = Config()
+    places = read_places(dataset, stride, max_frames, config)
+    depth = "sensor" if dataset.has_depth else "predicted"
+    overlap = overlaps(
+        dataset.camera, [p.depth.values for p in places], np.stack([p.T_world_camera for p in places]),
+        tolerance=_TOLERANCE[depth],
+    )  # fmt: skip
+    truth = labels(overlap)
+    earlier = earlier_frames([p.frame.timestamp_s for p in places], apart_s)
+    if not earlier:
+        raise DatasetError(f"{dataset.path}: is shorter than --apart {apart_s:g} s")
+    min_gap = min(q - max(frames) for q, frames in earlier.items())
+    rows = []
+    for method, answer in answerers(places, dataset, config, min_gap):
+        answers, cpu_ms = methods.ask(answer, earlier)
+        score = score_answers(answers, truth, earlier)
+        figures = {key: value for key, value in asdict(score).items() if key != "curve"}
+        rows.append(
+            {
+                "sequence": name, "method": method, "frames": len(places), "overlap_from": f"{depth} depth",
+                "figures": {**figures, "cpu_ms": cpu_ms}, "curve": score.curve.tolist(),
+            }  # fmt: skip
+        )
+    return rows
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows as Markdown."""
+    headings = ["sequence", "method", "queries", "seen before", *(heading for heading, _, _ in _COLUMNS)]
+    lines = ["| " + " | ".join(headings) + " |", "| --- " * len(headings) + "|"]
+    for row in rows:
+        figures = row["figures"]
+        cells = [f"{figures[key]:.{digits}f}" for _, key, digits in _COLUMNS]
+        counts = [str(figures["queries"]), str(figures["known"])]
+        lines.append("| " + " | ".join([row["sequence"], row["method"], *counts, *cells]) + " |")
+    return "\n".join(lines)
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.places", description=(__doc__ or "").splitlines()[0]
+    )
+    add = parser.add_argument
+    add("--data", type=Path, required=True, help="folder that holds the sequences")
+    add("--sequences", help="their names, with commas (default: all in --data)")
+    add("--stride", type=int, default=10, help="every so many frames one is taken")
+    add("--max-frames", type=int)
+    add("--apart", type=float, default=3.0, metavar="S", help="seconds a frame must be older to be an answer")
+    add("--output", type=Path, help=".json to write; table (.md) and plot (.svg) go beside it")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    options = parse(arguments)
+    try:
+        if options.stride < 1 or options.apart < 0:
+            raise ConfigError("--stride must be at least 1 and --apart no less than 0")
+        names = [name.strip() for name in options.sequences.split(",")] if options.sequences else None
+        begun = environment()
+        rows: list[dict[str, Any]] = []
+        for name, dataset in find_sequences(options.data, names).items():
+            tell(f"{name}: reading every {options.stride}th frame")
+            rows += judge(
+                name, dataset,
+                stride=options.stride, max_frames=options.max_frames, apart_s=options.apart,
+            )  # fmt: skip
+            if options.output:
+                _write(options, begun, rows)
+    except SlamdepthError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    print(table(rows))
+    return 0
+
+
+def _write(options: argparse.Namespace, begun: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
+    from benchmarks.places_plot import write_precision_recall
+
+    settings = {"stride": options.stride, "max_frames": options.max_frames, "apart_s": options.apart}
+    write_json(
+        options.output, {"format": FORMAT, "environment": begun, "settings": settings, "rows": list(rows)}
+    )
+    write_text(options.output.with_suffix(".md"), table(rows) + "\n")
+    write_precision_recall(options.output.with_suffix(".svg"), rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

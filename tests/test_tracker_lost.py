@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A camera that was lost: blanked for seconds, put elsewhere, before white walls."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracking_scene import (
+    COUNT,
+    ConstantDepth,
+    Run,
+    colour_only,
+    covered,
+    errors_m,
+    frames,
+    grey,
+    played,
+)
+
+from slamdepth.geometry import se3_exp
+from slamdepth.tracker.retry import Retry
+from slamdepth.types import Frame, StepResult, TrackingStatus
+
+LOST, RESCUED = TrackingStatus.LOST, TrackingStatus.RESCUED
+BLANK = 60  # two seconds
+
+
+def black(frame: Frame) -> Frame:
+    return replace(frame, image_rgb=np.zeros_like(frame.image_rgb), depth_m=None)
+
+
+def placed(results: list[StepResult]) -> list[bool]:
+    return [r.T_world_camera is not None for r in results]
+
+
+@pytest.mark.parametrize("predicted", [False, True])
+def test_two_seconds_of_black_frames(predicted: bool) -> None:
+    """What follows is tracked in the map of before; the first camera alone is aligned."""
+    given = played(
+        [*frames(range(28)), *[black(f) for f in frames([28] * BLANK)], *frames(range(32, COUNT))]
+    )
+    run = (
+        Run([colour_only(f) for f in given], ConstantDepth(depth_m=1.9, sigma_log=0.3))
+        if predicted
+        else Run(given)
+    )
+    assert all(placed(run.results[:28]))
+    assert [r.status for r in run.results[28 : 28 + BLANK]] == [LOST] * BLANK
+    assert run.results[28 + BLANK].status is TrackingStatus.RELOCALISED
+    assert all(placed(run.results[28 + BLANK :]))
+    keyframes = run.results[27].keyframes
+    if predicted:
+        assert run.tracker.finish().relocalisations == 1
+        return
+    assert errors_m(run.results)[28:].max() < 0.05
+    made = run.finish()
+    assert (made.tracked, made.relocalisations) == (COUNT - 4, 1)
+    assert len(made.keyframes) > keyframes
+
+
+def test_from_the_middle_to_the_end_and_then_from_the_start() -> None:
+    """The start overlaps what was seen, but the jump there is no motion to be tracked."""
+    order = [*range(24, 50), *range(24)]
+    run = Run(played(frames(order)))
+    jump = run.results[26]
+    assert jump.index == 0
+    assert jump.status in {TrackingStatus.TRACKING, TrackingStatus.RELOCALISED}
+    assert all(placed(run.results))
+    assert errors_m(run.results).max() < 0.05
+    assert run.finish().tracked == len(order)
+
+
+def test_a_white_room_is_tracked_from_first_to_last() -> None:
+    """Some hundred corners of desk and lamp, and walls without a mark."""
+    run = Run(frames(bare=True))
+    assert np.median([len(run.tracker.prepare(f).features) for f in frames(range(0, COUNT, 9), bare=True)]) < 200
+    assert all(placed(run.results))
+    assert errors_m(run.results).max() < 0.05
+
+
+def test_a_white_room_is_tracked_without_a_sensor() -> None:
+    run = Run(frames(change=colour_only, bare=True), ConstantDepth())
+    assert all(placed(run.results))
+
+
+def test_a_lost_camera_is_found_by_depth_alone() -> None:
+    """Nothing to see and, for two seconds, no depth either; then depth comes back."""
+    given = played(
+        [*frames(range(21)), *[black(f) for f in frames([21] * BLANK)], *frames(range(21, 36), grey)]
+    )
+    run = Run(given)
+    assert [r.status for r in run.results[21 : 21 + BLANK]] == [LOST] * BLANK
+    after = run.results[21 + BLANK :]
+    assert after[0].status in {LOST, RESCUED}  # every third frame is tried
+    assert [r.status for r in after[3:]] == [RESCUED] * 12
+    assert errors_m(run.results).max() < 0.05
+
+
+def test_depth_of_another_place_is_not_taken_for_the_old_one() -> None:
+    given = played(
+        [*frames(range(10)), *[black(f) for f in frames([10] * 6)], *frames(range(28, 44), grey)]
+    )
+    run = Run(given)
+    assert errors_m(run.results).max() < 0.05  # lost, or right
+
+
+def test_a_network_is_not_asked_at_every_lost_frame() -> None:
+    model = ConstantDepth()
+    upside_down = [
+        replace(colour_only(f), image_rgb=np.ascontiguousarray(f.image_rgb[::-1, ::-1, ::-1]))
+        for f in frames([30] * 48)
+    ]
+    run = Run(played([*frames(range(12), colour_only), *upside_down]), model)
+    assert run.statuses()[LOST] == 48
+    before = len([r for r in run.results if r.is_keyframe]) + 1
+    assert before + 5 <= model.calls <= before + 48 // 6 + 1
+
+    model = ConstantDepth()
+    run = Run(played([*frames(range(12), colour_only), *[black(f) for f in frames([12] * 48)]]), model)
+    assert model.calls <= len([r for r in run.results if r.is_keyframe]) + 1  # black frames say nothing
+
+
+def retried(*, instant: bool, frames: int, **more: bool) -> list[int]:
+    """The lost frames that are tried, counted from the first lost one as 1."""
+    retry = Retry()
+    retry.start(np.eye(4), np.eye(4))
+    found = []
+    for lost in range(2, frames):
+        retry.count_frame()
+        if retry.is_due(**{"has_depth": True, "is_instant": instant, "is_blank": False, **more}):
+            found.append(lost)
+    return found
+
+
+def test_retries_are_counted_in_frames_and_end() -> None:
+    assert retried(instant=True, frames=14) == [4, 7, 10, 13]
+    assert retried(instant=False, frames=20) == [7, 13, 19]
+    assert max(retried(instant=True, frames=1000)) == 118
+    assert retried(instant=False, frames=200, is_blank=True) == []
+    assert retried(instant=True, frames=14, is_blank=True) == [4, 7, 10, 13]
+    assert retried(instant=True, frames=200, has_depth=False) == []
+    never_lost = Retry()
+    never_lost.count_frame()
+    assert not never_lost.is_due(has_depth=True, is_instant=True, is_blank=False)
+
+
+def test_the_guess_goes_on_for_two_steps_and_stops() -> None:
+    velocity = se3_exp(np.array([0.02, 0.0, 0.01, 0.0, 0.03, 0.0]))
+    start = se3_exp(np.array([0.5, -0.2, 0.1, 0.3, 0.2, 0.1]))
+    retry = Retry()
+    retry.start(start, velocity)
+    np.testing.assert_allclose(retry.guess(), velocity @ start, atol=1e-12)
+    for _ in range(40):
+        retry.count_frame()
+    D = retry.guess() @ np.linalg.inv(start)
+    np.testing.assert_allclose(D[:3, 3], 2 * velocity[:3, 3], atol=1e-9)
