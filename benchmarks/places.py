@@ -46,7 +46,7 @@ _COLUMNS = (
 
 
 def read_places(dataset: Dataset, stride: int, max_frames: int | None, config: Config) -> list[methods.Place]:
-    """Every ``stride``-th frame that has a true pose, with depth, features and, where the backbone is, tokens.
+    """Every ``stride``-th frame that has a true pose and depth; with tokens where the backbone is there.
 
     Raises:
         DatasetError: there is no ground truth, or fewer than two such frames.
@@ -67,9 +67,13 @@ def read_places(dataset: Dataset, stride: int, max_frames: int | None, config: C
         patches, classes = tokens.of(frame.image_rgb) if tokens else ((), ())
         places.append(
             methods.Place(
-                frame, methods.features_of(frame, config), model.predict(frame),
-                truth.T_world_camera[nearest], patches, classes,
-            )  # fmt: skip
+                frame,
+                methods.features_of(frame, config),
+                model.predict(frame),
+                truth.T_world_camera[nearest],
+                patches,
+                classes,
+            )
         )
     if len(places) < 2:
         raise DatasetError(f"{dataset.path}: fewer than two frames have a true pose and depth")
@@ -167,9 +171,13 @@ def judge(
         figures = {key: value for key, value in asdict(score).items() if key != "curve"}
         rows.append(
             {
-                "sequence": name, "method": method, "frames": len(places), "overlap_from": f"{depth} depth",
-                "figures": {**figures, "cpu_ms": cpu_ms}, "curve": score.curve.tolist(),
-            }  # fmt: skip
+                "sequence": name,
+                "method": method,
+                "frames": len(places),
+                "overlap_from": f"{depth} depth",
+                "figures": {**figures, "cpu_ms": cpu_ms},
+                "curve": score.curve.tolist(),
+            }
         )
     return rows
 

@@ -175,6 +175,4 @@ def _add(landmarks: LandmarkMap, camera: Camera, config: Config, k: int, place: 
         pinhole, features.px[born], position_c, sigma_log[born], features.sigma_px[born]
     )
     R = place.T_world_camera[:3, :3]
-    landmarks.add_points(
-        keyframe, born, transform(place.T_world_camera, position_c), R @ covariance_c @ R.T
-    )
+    landmarks.add_points(keyframe, born, transform(place.T_world_camera, position_c), R @ covariance_c @ R.T)

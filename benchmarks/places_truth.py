@@ -54,9 +54,7 @@ def overlaps(
     return 0.5 * (seen + seen.T)
 
 
-def _share_seen(
-    camera: Camera, points_c: Floats, depth_m: NDArray[np.floating], tolerance: float
-) -> float:
+def _share_seen(camera: Camera, points_c: Floats, depth_m: NDArray[np.floating], tolerance: float) -> float:
     px, z = project(camera, points_c)
     limit = np.array([camera.width - 1, camera.height - 1])
     inside = np.flatnonzero((z > 0) & ((px >= 0) & (px <= limit)).all(axis=1))

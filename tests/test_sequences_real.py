@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from slamdepth.datasets import open_dataset
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.evaluation import score_trajectory
+from slamdepth.geometry import invert
 from slamdepth.tracker import Tracker
-from slamdepth.types import Reconstruction, TrackingStatus, Trajectory
+from slamdepth.types import Frame, Reconstruction, StepResult, TrackingStatus, Trajectory
 
 pytestmark = pytest.mark.data
 
@@ -51,3 +53,70 @@ def test_fr1_desk_with_a_prior_that_knows_nothing(data_dir: Path) -> None:
     """Two metres everywhere is enough: the views themselves tell the depth."""
     made, truth = run_beginning(data_dir / "rgbd_dataset_freiburg1_desk", 120, ConstantDepth(sigma_log=0.45))
     assert score_trajectory(truth, made.trajectory).sim3.rmse_m < 0.03
+
+
+def errors_in_one_map_m(
+    results: list[StepResult], taken_s: list[float], truth: Trajectory, aligned: int
+) -> np.ndarray:
+    """``(N,)`` distances from the truth, NaN where lost; the first ``aligned`` frames alone are aligned.
+
+    Args:
+        taken_s: when each frame was taken, whatever its time in the run.
+    """
+    found = [None if r.T_world_camera is None else r.T_world_camera[:3, 3] for r in results]
+    estimate = np.array([np.full(3, np.nan) if p is None else p for p in found])
+    nearest = [int(np.argmin(np.abs(truth.timestamps_s - t))) for t in taken_s]
+    moved = invert(truth.T_world_camera[nearest[0]]) @ truth.T_world_camera[nearest]
+    first = results[0].T_world_camera
+    assert first is not None
+    moved = first @ moved
+    shift = np.nanmean(estimate[:aligned] - moved[:aligned, :3, 3], axis=0)
+    return np.linalg.norm(estimate - moved[:, :3, 3] - shift, axis=1)
+
+
+def test_two_seconds_of_black_frames_in_the_kitchen(data_dir: Path) -> None:
+    """Frames 80 to 139 show nothing and measure nothing; what follows is in the map of before."""
+    folder = data_dir / "7scenes_redkitchen_seq-01"
+    if not folder.is_dir():
+        pytest.skip(f"{folder.name} is absent")
+    dataset = open_dataset(folder)
+    assert dataset.ground_truth is not None
+    tracker = Tracker(dataset.camera, SensorDepth(), Config())
+    results, taken_s = [], []
+    for index in range(190):
+        frame: Frame = dataset.read(index, with_depth=True)
+        if 80 <= index < 140:
+            frame = replace(frame, image_rgb=np.zeros_like(frame.image_rgb), depth_m=None)
+        results.append(tracker.step(frame))
+        taken_s.append(frame.timestamp_s)
+    assert all(r.status is TrackingStatus.TRACKING for r in results[:80])
+    assert all(r.status is TrackingStatus.LOST for r in results[80:140])
+    after = results[140:]
+    assert after[0].status is TrackingStatus.RELOCALISED
+    assert all(r.T_world_camera is not None for r in after)
+    errors = errors_in_one_map_m(results, taken_s, dataset.ground_truth, aligned=80)
+    assert np.isfinite(errors[140:]).all()
+    assert errors[140:].max() < 0.1
+    made = tracker.finish()
+    assert made.relocalisations == 1
+    assert score_trajectory(dataset.ground_truth, made.trajectory).se3.rmse_m < 0.04
+
+
+def test_fr1_rpy_from_the_middle_and_then_from_the_start(data_dir: Path) -> None:
+    """Frames 300 to 379, then 0 to 49: a jump by more than a frame's motion, into a place seen before."""
+    folder = data_dir / "rgbd_dataset_freiburg1_rpy"
+    if not folder.is_dir():
+        pytest.skip(f"{folder.name} is absent")
+    dataset = open_dataset(folder)
+    assert dataset.ground_truth is not None
+    tracker = Tracker(dataset.camera, SensorDepth(), Config())
+    results, taken_s = [], []
+    for k, index in enumerate([*range(300, 380), *range(50)]):
+        frame = dataset.read(index, with_depth=True)
+        taken_s.append(frame.timestamp_s)
+        results.append(tracker.step(replace(frame, timestamp_s=k / 30.0)))
+    assert all(r.T_world_camera is not None for r in results[:80])
+    assert TrackingStatus.RELOCALISED in {r.status for r in results[80:]}
+    assert all(r.T_world_camera is not None for r in results[-30:])
+    errors = errors_in_one_map_m(results, taken_s, dataset.ground_truth, aligned=80)
+    assert np.nanmax(errors[80:]) < 0.1

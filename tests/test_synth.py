@@ -225,6 +225,18 @@ def test_noise_blur_light_and_texture_do_what_they_say(renderer: Renderer) -> No
     assert steps[0] < 0.6 * steps[1]
 
 
+def test_a_bare_room_has_shape_but_no_marks(renderer: Renderer) -> None:
+    bare, _ = next(render_frames(CLEAN.model_copy(update={"texture": "bare"}), [3]))
+    fast = cv2.FastFeatureDetector_create(15)
+    corners = [
+        len(fast.detect(cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)))
+        for frame in (bare, render_frame(renderer, CLEAN, 3)[0])
+    ]
+    assert 0 < corners[0] < 0.25 * corners[1]
+    assert bare.depth_m is not None
+    assert np.ptp(bare.depth_m) > 0.5
+
+
 def test_there_is_plenty_to_track(renderer: Renderer) -> None:
     grey = cv2.cvtColor(render_frame(renderer, CLEAN, 3)[0].image_rgb, cv2.COLOR_RGB2GRAY)
     assert len(cv2.FastFeatureDetector_create(15).detect(grey)) > 250

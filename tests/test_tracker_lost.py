@@ -12,7 +12,6 @@ from tracking_scene import (
     ConstantDepth,
     Run,
     colour_only,
-    covered,
     errors_m,
     frames,
     grey,
@@ -38,9 +37,7 @@ def placed(results: list[StepResult]) -> list[bool]:
 @pytest.mark.parametrize("predicted", [False, True])
 def test_two_seconds_of_black_frames(predicted: bool) -> None:
     """What follows is tracked in the map of before; the first camera alone is aligned."""
-    given = played(
-        [*frames(range(28)), *[black(f) for f in frames([28] * BLANK)], *frames(range(32, COUNT))]
-    )
+    given = played([*frames(range(28)), *[black(f) for f in frames([28] * BLANK)], *frames(range(32, COUNT))])
     run = (
         Run([colour_only(f) for f in given], ConstantDepth(depth_m=1.9, sigma_log=0.3))
         if predicted
@@ -75,7 +72,8 @@ def test_from_the_middle_to_the_end_and_then_from_the_start() -> None:
 def test_a_white_room_is_tracked_from_first_to_last() -> None:
     """Some hundred corners of desk and lamp, and walls without a mark."""
     run = Run(frames(bare=True))
-    assert np.median([len(run.tracker.prepare(f).features) for f in frames(range(0, COUNT, 9), bare=True)]) < 200
+    counts = [len(run.tracker.prepare(frame).features) for frame in frames(range(0, COUNT, 9), bare=True)]
+    assert np.median(counts) < 200
     assert all(placed(run.results))
     assert errors_m(run.results).max() < 0.05
 
@@ -99,9 +97,7 @@ def test_a_lost_camera_is_found_by_depth_alone() -> None:
 
 
 def test_depth_of_another_place_is_not_taken_for_the_old_one() -> None:
-    given = played(
-        [*frames(range(10)), *[black(f) for f in frames([10] * 6)], *frames(range(28, 44), grey)]
-    )
+    given = played([*frames(range(10)), *[black(f) for f in frames([10] * 6)], *frames(range(28, 44), grey)])
     run = Run(given)
     assert errors_m(run.results).max() < 0.05  # lost, or right
 

@@ -40,7 +40,9 @@ class SynthSettings(BaseModel):
     width: int = Field(640, ge=32, le=4096, description="image width in pixels")
     height: int = Field(480, ge=32, le=4096, description="image height in pixels")
     seed: int = Field(0, ge=0, description="seed of layout, colours, path and noise")
-    texture: Literal["rich", "low", "bare"] = Field("rich", description="how much there is to see on surfaces")
+    texture: Literal["rich", "low", "bare"] = Field(
+        "rich", description="how much there is to see on surfaces"
+    )
     lighting_variation: float = Field(
         0.05, ge=0, le=1, description="swing of exposure and white balance over the sequence, relative"
     )

@@ -95,7 +95,7 @@ class LoopCloser:
         return [k for k, score in answers if score >= least]
 
     def verify(self, keyframe: MapKeyframe, candidate: int) -> tuple[Placement, float] | None:
-        """Where ``candidate`` says that ``keyframe`` is, and its metres there; None where it sees another place."""
+        """Where ``candidate`` places ``keyframe``, and the ratio of its metres; None where it sees it not."""
         placement = self._localiser.from_keyframe(keyframe.features, candidate, minimum=15)
         if placement is None or placement.inliers < self._config.loops.min_inliers:
             return None

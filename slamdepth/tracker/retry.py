@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.geometry import invert, so3_exp, so3_log
+from slamdepth.geometry import so3_exp, so3_log
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
