@@ -34,6 +34,7 @@ class MapKeyframe:
         point_ids: ``(N,)`` row of the map point each keypoint sees, -1 for none.
         log_depth, sigma_log: ``(N,)`` depth prior of each keypoint in metres of the
             map, NaN where it has none.
+        predicted_log_depth: ``(N,)`` what a network said of each keypoint, NaN where nothing.
         velocity: ``(6,)`` m/s and rad/s in the camera's own axes when it was taken.
     """
 
@@ -45,6 +46,7 @@ class MapKeyframe:
     log_depth: Floats
     sigma_log: Floats
     prediction: DepthPrediction | None = None
+    predicted_log_depth: Floats = field(default_factory=lambda: np.zeros(0))
     scale: float = 1.0
     velocity: Floats = field(default_factory=lambda: np.zeros(6))
 

@@ -18,6 +18,7 @@ import numpy as np
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import orthonormalised, rotation_angle_rad
+from slamdepth.mapping.keyframe_store import KeyframeStore
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.frame_log import FrameLog
@@ -88,6 +89,7 @@ class Keyframes:
         self._depth = depth
         self._shutter = shutter
         self._timed = watch.timed
+        self._store = KeyframeStore(config.map.keyframe_memory_mib)
         self._reference_overlap = 0.0
         self._still = 0
         self._seen_share = 1.0  # of what the last keyframe knew, when its own points were born
@@ -188,6 +190,7 @@ class Keyframes:
                 self._mapper.adjust_window(keyframe)
         with self._timed("mapping"):
             self._mapper.cull(keyframe)
+            self._store.tidy(self._map.keyframes)
         if self._reference_overlap > 0:
             self._seen_share = max(self._still / self._reference_overlap, 0.1)
         self._reference_overlap = 0.0
