@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 
 from slamdepth.config import Config
 from slamdepth.depth.sensor import SensorDepth
+from slamdepth.mapping import landmarks
 from slamdepth.mapping.keyframe_store import KeyframeStore, NamelessFile, StoredFrame, StoredPrediction
 from slamdepth.mapping.packing import Numbers, pack_image, pack_measured, pack_predicted, unpack_image
 from slamdepth.pipeline.known_size import rescaled
+from slamdepth.tracker import frame_log
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Reconstruction
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5, depth_factor=5000.0)
@@ -200,6 +202,25 @@ def reconstruction(mib: float, change: scene.Change | None = None, model: Any = 
     )
     run = scene.Run(scene.frames(range(0, scene.COUNT), change), model, config)
     return run.finish()
+
+
+def test_giving_rows_away_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(landmarks, "_LEAST_ROWS", 64)
+    monkeypatch.setattr(frame_log, "_PRUNE_AT", 16)
+    results, rows, pruned_at = [], [], []
+    for compact_at in (10**9, 64):
+        run = scene.Run([], scene.ConstantDepth())
+        run.tracker._map._compact_at = compact_at
+        for frame in scene.frames(change=scene.colour_only):
+            run.tracker.step(frame)
+        rows.append(run.tracker._map.size)
+        pruned_at.append(run.tracker._log._prune_at)
+        results.append(run.finish())
+    assert rows[1] < 0.7 * rows[0]
+    assert pruned_at[0] == 16 < pruned_at[1]
+    plain, compact = results
+    np.testing.assert_array_equal(plain.trajectory.T_world_camera, compact.trajectory.T_world_camera)
+    np.testing.assert_array_equal(plain.points_m, compact.points_m)
 
 
 @pytest.mark.parametrize("depth", ["sensor", "predicted"])

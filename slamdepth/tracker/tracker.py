@@ -142,6 +142,7 @@ class Tracker:
         self._keyframes.count_frame()
         if self._keyframes.is_due:
             self._join()
+        self._forget_points()
         with self._watch.timed("tracking"):
             features = self._still(frame, plain)
             placement, status = self._place(frame, features)
@@ -196,6 +197,14 @@ class Tracker:
         if moved is not None and self._last is not None:
             self._last = replace(self._last, T_camera_world=moved.carry(self._last.T_camera_world))
         return moved
+
+    def _forget_points(self) -> None:
+        """Let the map give away the rows of points that are gone; nobody else remembers rows by now."""
+        now = self._map.compact()
+        if now is not None:
+            self._log.renumber(now)
+            if self._last is not None:
+                self._last = replace(self._last, point_ids=now[self._last.point_ids])
 
     def _place_again(self, features: Features, placement: Placement) -> Placement:
         """Place a frame in the map that its keyframe's depth has just made larger."""
