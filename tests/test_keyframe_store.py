@@ -247,3 +247,24 @@ def test_a_run_with_nothing_in_memory_is_the_same_run(depth: str) -> None:
     np.testing.assert_array_equal(
         rescaled(rescaled(away, 2.0), 0.5).keyframes[0].depth_m, away.keyframes[0].depth_m
     )
+
+
+def test_a_keyframe_and_a_frame_take_little() -> None:
+    """What stays in memory of an old keyframe, and of an ordinary frame, has a bound."""
+    config = Config.from_dict(
+        {
+            "map": {"keyframe_memory_mib": 0.0},
+            "tracking": {"keyframe_overlap": 0.9, "keyframe_overlap_start": 0.9},
+        }
+    )
+    run = scene.Run(scene.frames(), config=config)
+    held = run.tracker.held()
+    keyframes = run.results[-1].keyframes
+    assert keyframes > 10
+    features = config.features.count
+    assert 0 < held.features < keyframes * features * 160
+    assert 0 < held.frames < scene.COUNT * (128 + features * 16)
+    assert held.points < 2 * 4096 * 256
+    newest = 8 * 320 * 240 * (3 + 4)
+    assert held.images == newest
+    assert 0 < held.on_disk < (keyframes - 8) * 320 * 240 * 2

@@ -60,7 +60,7 @@ class PackedMap:
 def pack_measured(depth_m: NDArray[np.float32], per_m: float) -> PackedMap:
     """Pack ``(H, W)`` float32 bit for bit: as whole numbers of ``1 / per_m`` metres where it is
     made of such, as a 16-bit depth image is."""
-    with np.errstate(invalid="ignore"):  # not a number: is not equal below
+    with np.errstate(invalid="ignore", over="ignore"):  # such numbers are not equal below
         words = np.rint(depth_m * np.float32(per_m)).clip(0, 65535).astype(np.uint16)
     if np.array_equal(_metres(words, per_m), depth_m):
         return PackedMap(_packed_words(words), Numbers.UNITS, _shape(depth_m), depth_m.dtype, per_m)

@@ -58,6 +58,12 @@ class FrameLog:
     def __len__(self) -> int:
         return len(self._placed)
 
+    @property
+    def held_bytes(self) -> int:
+        """Of the arrays."""
+        seen = sum(p.rows.nbytes + p.px.nbytes + p.sigma_px.nbytes for p in self._placed)
+        return seen + sum(p.T_camera_keyframe.nbytes for p in self._placed) + self._row_now.nbytes
+
     def add(self, timestamp_s: float, features: Features, placement: Placement, is_keyframe: bool) -> None:
         """Remember where a frame is, relative to a keyframe that sees the same.
 

@@ -66,6 +66,9 @@ class Keyframes:
 
     Args:
         watch: measures the stages.
+
+    Attributes:
+        store: where their images lie.
     """
 
     def __init__(
@@ -89,7 +92,7 @@ class Keyframes:
         self._depth = depth
         self._shutter = shutter
         self._timed = watch.timed
-        self._store = KeyframeStore(config.map.keyframe_memory_mib)
+        self.store = KeyframeStore(config.map.keyframe_memory_mib)
         self._reference_overlap = 0.0
         self._still = 0
         self._seen_share = 1.0  # of what the last keyframe knew, when its own points were born
@@ -190,7 +193,7 @@ class Keyframes:
                 self._mapper.adjust_window(keyframe)
         with self._timed("mapping"):
             self._mapper.cull(keyframe)
-            self._store.tidy(self._map.keyframes)
+            self.store.tidy(self._map.keyframes)
         if self._reference_overlap > 0:
             self._seen_share = max(self._still / self._reference_overlap, 0.1)
         self._reference_overlap = 0.0

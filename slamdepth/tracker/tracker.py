@@ -20,6 +20,7 @@ from slamdepth.tracker.checks import check_frame, model_for
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.finish import build_reconstruction, optimise_everything
 from slamdepth.tracker.frame_log import FrameLog
+from slamdepth.tracker.held import HeldBytes, held_bytes
 from slamdepth.tracker.keyframes import Keyframes, Moved
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Localiser, Placement
@@ -310,6 +311,10 @@ class Tracker:
     def _depth_of(self, frame: Frame) -> DepthPrediction:
         with self._watch.timed("depth"):
             return self._depth.take(frame)
+
+    def held(self) -> HeldBytes:
+        """How much memory keyframes, points and frames take by now."""
+        return held_bytes(self._map, self._log, self._keyframes.store)
 
     def _remember_motion(self, frame: Frame, measured: Placement, final: Placement) -> None:
         """Velocity from the pose as measured, so that a correction of the map is not taken for motion."""
