@@ -268,3 +268,23 @@ def test_a_keyframe_and_a_frame_take_little() -> None:
     newest = 8 * 320 * 240 * (3 + 4)
     assert held.images == newest
     assert 0 < held.on_disk < (keyframes - 8) * 320 * 240 * 2
+
+
+def test_going_back_and_forth_makes_few_keyframes() -> None:
+    """Known ground is measured by the keyframes that were made there."""
+    config = Config.from_dict(
+        {
+            "features": {"count": 600},
+            "tracking": {"keyframe_overlap": 0.85, "keyframe_overlap_start": 0.9},
+            "loops": {"min_gap": 4},
+        }
+    )
+    there = list(range(scene.COUNT))
+    order = [*there, *there[-2::-1], *there[1:], *there[-2::-1]]
+    given = [
+        replace(scene.walk()[0][i], index=n, timestamp_s=n / scene.SETTINGS.fps) for n, i in enumerate(order)
+    ]
+    run = scene.Run(given, config=config)
+    assert all(result.T_world_camera is not None for result in run.results)
+    first, last = run.results[scene.COUNT - 1].keyframes, run.results[-1].keyframes
+    assert last <= first + 4  # 33 more where the last keyframe is what counts
