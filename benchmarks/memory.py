@@ -101,7 +101,8 @@ def growth(samples: list[Sample], first_play: int) -> dict[str, float]:
     """What each keyframe and frame adds, and ten minutes of nothing but new ground would need."""
     first = next(s for s in samples if s.frames >= min(first_play, samples[-1].frames))
     last = samples[-1]
-    away = 0.0 if last.on_disk == 0 else last.on_disk / max(1, last.keyframes)
+    more = last.keyframes - first.keyframes
+    away = (last.on_disk - first.on_disk) / more if more and first.on_disk else 0.0  # once the budget is full
     keyframe_mib = (last.features + last.points) / last.keyframes
     frame_kib = 1024 * last.seen / last.frames
     rate = first.keyframes / first.frames

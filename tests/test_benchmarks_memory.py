@@ -22,12 +22,12 @@ def test_the_ends_come_once(count: int, expected: list[int]) -> None:
 
 def test_growth_is_that_of_new_ground() -> None:
     samples = [
-        Sample(100, 10, resident=220.0, images=20.0, features=1.0, points=1.0, seen=0.5, on_disk=0.0),
+        Sample(100, 10, resident=220.0, images=20.0, features=1.0, points=1.0, seen=0.5, on_disk=1.0),
         Sample(400, 20, resident=340.0, images=30.0, features=2.0, points=2.0, seen=2.0, on_disk=4.0),
     ]
     figures = growth(samples, first_play=100)
     assert figures["keyframe_mib"] == pytest.approx(0.2)
-    assert figures["keyframe_disk_mib"] == pytest.approx(0.2)
+    assert figures["keyframe_disk_mib"] == pytest.approx(0.3)
     assert figures["frame_kib"] == pytest.approx(5.12)
     assert figures["keyframes_per_frame_of_new_ground"] == pytest.approx(0.1)
     # 304 MiB of libraries, 30 of images, then 1,800 keyframes and 18,000 frames

@@ -28,7 +28,7 @@ _PRUNE_AT = 256  # frames, then always twice as many
 _MAX_SHIFT_SHARE = 0.1  # of the scene's distance: a refinement is no relocation
 
 
-@dataclass
+@dataclass(slots=True)
 class _Placed:
     timestamp_s: float
     keyframe: int
