@@ -263,7 +263,7 @@ def test_a_keyframe_and_a_frame_take_little() -> None:
     assert keyframes > 10
     features = config.features.count
     assert 0 < held.features < keyframes * features * 160
-    assert 0 < held.frames < scene.COUNT * (128 + features * 16)
+    assert 0 < held.frames < scene.COUNT * (128 + features * 20)
     assert held.points < 2 * 4096 * 256
     newest = 8 * 320 * 240 * (3 + 4)
     assert held.images == newest

@@ -61,8 +61,8 @@ class FrameLog:
     @property
     def held_bytes(self) -> int:
         """Of the arrays."""
-        seen = sum(p.rows.nbytes + p.px.nbytes + p.sigma_px.nbytes for p in self._placed)
-        return seen + sum(p.T_camera_keyframe.nbytes for p in self._placed) + self._row_now.nbytes
+        of_frames = ((p.T_camera_keyframe, p.rows, p.px, p.phase, p.sigma_px) for p in self._placed)
+        return self._row_now.nbytes + sum(array.nbytes for arrays in of_frames for array in arrays)
 
     def add(self, timestamp_s: float, features: Features, placement: Placement, is_keyframe: bool) -> None:
         """Remember where a frame is, relative to a keyframe that sees the same.
