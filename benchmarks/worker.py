@@ -136,7 +136,7 @@ def measure(system: System, dataset: Dataset, indices: range, job: Job) -> tuple
     estimate = system.finish()
     finish_s = time.perf_counter() - begin
     cpu_s = _cpu_s() - start_cpu_s - reading_cpu_s
-    return Measured(step_s, finish_s, cpu_s, _peak_memory_mib(), without_depth), estimate
+    return Measured(step_s, finish_s, cpu_s, memory_mib("VmHWM"), without_depth), estimate
 
 
 def score(truth: Trajectory | None, estimate: Estimate, notes: list[str]) -> dict[str, float]:
@@ -180,11 +180,14 @@ def _cpu_s() -> float:
     return time.process_time() + children.ru_utime + children.ru_stime
 
 
-def _peak_memory_mib() -> float:
-    """Of this process alone; on Linux ``ru_maxrss`` would start at that of the parent."""
+def memory_mib(name: str) -> float:
+    """Of this process alone, the most ever ("VmHWM") or now ("VmRSS").
+
+    On Linux ``ru_maxrss`` would start at that of the parent; elsewhere it is the most, for both.
+    """
     try:
         lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
-        return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+        return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(name))
     except (OSError, StopIteration):
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak / (2**20 if sys.platform == "darwin" else 2**10)

@@ -149,8 +149,13 @@ class ScaleConfig(_Section):
 
 
 class MapConfig(_Section):
-    """TSDF fusion and the mesh."""
+    """What is kept of the keyframes, TSDF fusion and the mesh."""
 
+    keyframe_memory_mib: float = Field(
+        256.0,
+        ge=0,
+        description="images and depth maps of keyframes beyond so many MiB wait in a temporary file",
+    )
     voxel_size_m: float = Field(0.02, gt=0, le=1.0, description="edge of a voxel in metres")
     max_depth_m: float = Field(4.0, gt=0, description="depth beyond this is not fused")
     min_component_triangles: int = Field(

@@ -235,6 +235,9 @@ class Trajectory:
 class Keyframe:
     """A keyframe after optimisation, with what the map fusion needs.
 
+    Images and depth maps of a tracker's keyframes may be made when they are asked for, each
+    time anew, because those of all keyframes together may be more than memory holds.
+
     Attributes:
         id: number of the keyframe, from 0.
         frame: its image (and sensor depth where there is one).
@@ -255,6 +258,20 @@ class Keyframe:
     keypoints_px: NDArray[np.float64]
     depth_scale: float
     prediction: DepthPrediction
+
+    def rescaled(self, factor: float) -> Keyframe:
+        """The keyframe in a map whose lengths were multiplied by ``factor``.
+
+        Prediction and sensor depth stay as they were given; what the map makes of them changes.
+        """
+        T = self.T_world_camera.copy()
+        T[:3, 3] *= factor
+        return replace(
+            self,
+            T_world_camera=T,
+            depth_m=self.depth_m * np.float32(factor),
+            depth_scale=self.depth_scale * factor,
+        )
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from slamdepth.depth.alignment import (
     DEFAULT_SIGMA_LOG,
     MAX_ANCHORS,
     DepthField,
     FieldSettings,
-    apply_field,
+    coarse_correction,
+    corrected_depth,
     fit_depth_field,
     log_depth_at,
     prior_log_depth_at,
@@ -167,10 +169,14 @@ def fitted(bias: float = 0.2, sigma: float = 0.2) -> DepthField:
     )  # fmt: skip
 
 
-def test_apply_field_is_the_field_at_every_pixel() -> None:
+def dense_depth(field: DepthField, of: DepthPrediction) -> NDArray[np.float32]:
+    return corrected_depth(coarse_correction(field, of), of)
+
+
+def test_the_corrected_depth_is_the_field_at_every_pixel() -> None:
     field = fitted()
     metric = prediction()
-    dense = apply_field(field, metric)
+    dense = dense_depth(field, metric)
     assert dense.shape == (HEIGHT, WIDTH)
     assert dense.dtype == np.float32
     u, v = np.meshgrid(np.arange(0, WIDTH, 5), np.arange(0, HEIGHT, 5))
@@ -182,35 +188,35 @@ def test_apply_field_is_the_field_at_every_pixel() -> None:
     np.testing.assert_allclose(dense[v, u].ravel(), expected, rtol=0.02)
 
 
-def test_apply_field_keeps_the_unknown_unknown() -> None:
+def test_the_corrected_depth_keeps_the_unknown_unknown() -> None:
     metric = prediction()
     metric.values[50:60, 100:140] = 0.0
     metric.values[0, 0] = np.nan
-    dense = apply_field(fitted(), metric)
+    dense = dense_depth(fitted(), metric)
     assert (dense[50:60, 100:140] == 0).all()
     assert dense[0, 0] == 0
     assert np.isfinite(dense).all()
     assert (dense > 0).sum() == WIDTH * HEIGHT - 401
-    assert (apply_field(fitted(), prediction(np.zeros((HEIGHT, WIDTH)))) == 0).all()
+    assert (dense_depth(fitted(), prediction(np.zeros((HEIGHT, WIDTH)))) == 0).all()
 
 
 def test_an_unknown_doubt_spoils_no_neighbours() -> None:
     metric = prediction()
     assert metric.sigma_log is not None
     metric.sigma_log[16, 16] = np.nan
-    dense = apply_field(fitted(), metric)
+    dense = dense_depth(fitted(), metric)
     assert (dense > 0).sum() >= WIDTH * HEIGHT - 1
 
 
-def test_apply_field_without_anchors_is_the_prior() -> None:
+def test_the_corrected_depth_without_anchors_is_the_prior() -> None:
     nothing = np.zeros(0)
     field = fit_depth_field(np.zeros((0, 2)), nothing, nothing, nothing, nothing, width=WIDTH)
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     px = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
     prior = np.exp(prior_log_depth_at(prediction(), px)[0]).reshape(HEIGHT, WIDTH)
-    np.testing.assert_allclose(apply_field(field, prediction()), prior, rtol=1e-5)
+    np.testing.assert_allclose(dense_depth(field, prediction()), prior, rtol=1e-5)
     sure = prediction(sigma=1e-3)
-    np.testing.assert_allclose(apply_field(field, sure), sure.values, rtol=1e-4)
+    np.testing.assert_allclose(dense_depth(field, sure), sure.values, rtol=1e-4)
 
 
 def test_the_prior_shrinks_what_is_unsure_towards_the_middle() -> None:

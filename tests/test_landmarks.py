@@ -124,6 +124,25 @@ class MapOperations(RuleBasedStateMachine):
         pairs = np.unique(rng.integers(0, (len(self.map.keyframes), 8), (4, 2)), axis=0)
         self.map.drop_observations(pairs[:, 0], pairs[:, 1])
 
+    @rule()
+    def compact(self) -> None:
+        landmarks = self.map
+        n = landmarks.size
+        ends = landmarks.resolve(np.arange(n))
+        position_w, descriptor = landmarks.position_w[ends].copy(), landmarks.descriptor[ends].copy()
+        order = landmarks.alive[:n].nonzero()[0]
+        landmarks._compact_at = 0
+        now = landmarks.compact()
+        assert now is not None
+        assert now.shape == (n + 1,)
+        assert now[-1] == -1
+        assert landmarks.size == landmarks.alive.sum()
+        np.testing.assert_array_equal(now[:n] >= 0, ends >= 0)
+        np.testing.assert_array_equal(now[order], np.arange(landmarks.size))
+        np.testing.assert_array_equal(landmarks.position_w[now[:n]][ends >= 0], position_w[ends >= 0])
+        np.testing.assert_array_equal(landmarks.descriptor[now[:n]][ends >= 0], descriptor[ends >= 0])
+        self.gone_into = {}  # those rows belong to others now
+
     @invariant()
     def consistent(self) -> None:
         check(self.map)
@@ -172,6 +191,27 @@ def test_arrays_grow_beyond_their_capacity() -> None:
     np.testing.assert_array_equal(landmarks.covariance_w[rows], covariance)
     np.testing.assert_array_equal(landmarks.alias[more], more)
     np.testing.assert_array_equal(landmarks.descriptor[more], second.features.descriptors)
+    check(landmarks)
+
+
+def test_rows_are_given_away_when_they_have_doubled() -> None:
+    landmarks = LandmarkMap()
+    first = keyframe(0, 5000)
+    landmarks.add_keyframe(first)
+    assert landmarks.compact() is None  # nothing to be had yet
+    rows = born(landmarks, first, list(range(5000)))
+    landmarks.kill(rows[::2])
+    assert landmarks.compact() is not None
+    assert landmarks.size == 2500
+    assert len(landmarks.alive) == 5000
+    assert landmarks.compact() is None
+    for i in range(1, 41):  # a walk on which all that is born dies
+        k = keyframe(i, 1000)
+        landmarks.add_keyframe(k)
+        landmarks.kill(born(landmarks, k, list(range(1000))))
+        landmarks.compact()
+        assert landmarks.size <= 6000
+    assert len(landmarks.alive) <= 10000
     check(landmarks)
 
 

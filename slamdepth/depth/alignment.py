@@ -223,13 +223,13 @@ def fit_depth_field(
     return DepthField(field._px, field._log, field._sigma, solved, factor, prior_offset, unit_px, settings)
 
 
-def apply_field(field: DepthField, prediction: DepthPrediction, step_px: int = 16) -> NDArray[np.float32]:
-    """The whole prediction in metres of the map, ``(H, W)`` float32, 0 = unknown.
+def coarse_correction(
+    field: DepthField, prediction: DepthPrediction, step_px: int = 16
+) -> NDArray[np.float32]:
+    """The log correction of a whole prediction on a grid ``(h, w)`` over its pixels.
 
-    The correction is smooth, so it is evaluated about every ``step_px`` pixels and interpolated.
+    It is smooth, so a value about every ``step_px`` pixels is enough.
     """
-    import cv2
-
     height, width = prediction.values.shape
     # the grid ends on the last row and column: nothing is extrapolated
     rows = np.linspace(0, height - 1, -(-(height - 1) // step_px) + 1)
@@ -240,13 +240,21 @@ def apply_field(field: DepthField, prediction: DepthPrediction, step_px: int = 1
     centre = _centre(prediction)
     doubt = np.nan_to_num(doubt, nan=DEFAULT_SIGMA_LOG)
     coarse = field.mean(px, np.nan_to_num(at, nan=centre), doubt).reshape(grid_u.shape)
+    return np.asarray(coarse, np.float32)
+
+
+def corrected_depth(coarse: NDArray[np.float32], prediction: DepthPrediction) -> NDArray[np.float32]:
+    """A prediction with the correction of :func:`coarse_correction`: metres of the map,
+    ``(H, W)`` float32, 0 = unknown."""
+    import cv2
+
+    height, width = prediction.values.shape
     map_u, map_v = np.meshgrid(
-        np.linspace(0, len(cols) - 1, width, dtype=np.float32),
-        np.linspace(0, len(rows) - 1, height, dtype=np.float32),
+        np.linspace(0, coarse.shape[1] - 1, width, dtype=np.float32),
+        np.linspace(0, coarse.shape[0] - 1, height, dtype=np.float32),
     )
-    dense = cv2.remap(
-        coarse.astype(np.float32), map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    dense = cv2.remap(coarse, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    centre = _centre(prediction)
     values = prediction.values.astype(np.float32, copy=False)
     known = np.isfinite(values) & (values > 0)
     log = np.log(np.where(known, values, np.float32(1.0)))

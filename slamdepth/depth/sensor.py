@@ -36,7 +36,9 @@ class SensorDepth:
             raise DatasetError(
                 f"frame {frame.index} has no sensor depth; choose a predicted depth (--depth dinov2)"
             )
-        known = np.isfinite(frame.depth_m) & (frame.depth_m > 0)
-        values = np.where(known, frame.depth_m, 0.0).astype(np.float32)
+        values = frame.depth_m.astype(np.float32, copy=False)  # shared, not kept twice
+        unknown = ~(np.isfinite(values) & (values >= 0))
+        if unknown.any():
+            values = np.where(unknown, np.float32(0.0), values)
         sigma_log = np.hypot(KINECT_NOISE_PER_M * values, SIGMA_FLOOR).astype(np.float32)
         return DepthPrediction(values, self.kind, sigma_log, is_sensor=True)

@@ -37,10 +37,12 @@ def trusted_depth(keyframe: Keyframe, max_depth_m: float) -> Depth:
     predicted depth, the quarter the model is least sure of (never those with a
     ``sigma_log`` under 0.15, always those over 0.6).
     """
-    depth = np.where(np.isfinite(keyframe.depth_m), keyframe.depth_m, np.float32(0.0)).astype(np.float32)
+    depth_m = keyframe.depth_m
+    depth = np.where(np.isfinite(depth_m), depth_m, np.float32(0.0)).astype(np.float32)
     drop = (depth <= 0.0) | (depth > max_depth_m) | _at_jumps(depth)
-    if keyframe.sigma_log is not None and not keyframe.prediction.is_sensor:
-        sigma = np.where(np.isfinite(keyframe.sigma_log), keyframe.sigma_log, np.inf)
+    sigma_log = None if keyframe.prediction.is_sensor else keyframe.sigma_log
+    if sigma_log is not None:
+        sigma = np.where(np.isfinite(sigma_log), sigma_log, np.inf)
         valid = sigma[~drop]
         if len(valid):
             limit = np.clip(np.quantile(valid, _SIGMA_SHARE), _SIGMA_SURE, _SIGMA_UNSURE)

@@ -2,8 +2,8 @@
 """The sparse map while it grows: points in arrays, keyframes in a list.
 
 Points live in growing arrays and are named by their row, so that everything done to
-them is done to whole arrays. A point that dies keeps its row; one merged into another
-points there through ``alias``.
+them is done to whole arrays. A point that dies keeps its row, and one merged into another
+points there through ``alias``, until :meth:`LandmarkMap.compact` gives the rows away.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ class MapKeyframe:
         point_ids: ``(N,)`` row of the map point each keypoint sees, -1 for none.
         log_depth, sigma_log: ``(N,)`` depth prior of each keypoint in metres of the
             map, NaN where it has none.
+        predicted_log_depth: ``(N,)`` what a network said of each keypoint, NaN where nothing.
         velocity: ``(6,)`` m/s and rad/s in the camera's own axes when it was taken.
     """
 
@@ -45,6 +46,7 @@ class MapKeyframe:
     log_depth: Floats
     sigma_log: Floats
     prediction: DepthPrediction | None = None
+    predicted_log_depth: Floats = field(default_factory=lambda: np.zeros(0))
     scale: float = 1.0
     velocity: Floats = field(default_factory=lambda: np.zeros(6))
 
@@ -58,33 +60,39 @@ class MapKeyframe:
         return invert(self.T_camera_world)
 
 
+_LEAST_ROWS = 4096
+
+
 class LandmarkMap:
     """Map points and the keyframes that see them."""
 
     def __init__(self) -> None:
         self.keyframes: list[MapKeyframe] = []
         self.size = 0
-        self._grow(4096)
+        self._compact_at = _LEAST_ROWS
+        self._move(np.zeros(0, dtype=np.int64), _LEAST_ROWS)
 
-    def _grow(self, capacity: int) -> None:
-        def bigger(name: str, shape: tuple[int, ...], dtype: Any) -> None:
+    def _move(self, kept: Ints, capacity: int) -> None:
+        """Make room for ``capacity`` points, with the rows ``kept`` as the first ones."""
+
+        def move(name: str, shape: tuple[int, ...], dtype: Any) -> None:
             array = np.zeros((capacity, *shape), dtype=dtype)
-            if self.size:
-                array[: self.size] = getattr(self, name)[: self.size]
+            if len(kept):
+                array[: len(kept)] = getattr(self, name)[kept]
             setattr(self, name, array)
 
-        bigger("position_w", (3,), np.float64)
-        bigger("covariance_w", (3, 3), np.float64)
-        bigger("descriptor", (32,), np.uint8)
-        bigger("birth_keyframe", (), np.int64)
-        bigger("octave", (), np.int64)
-        bigger("distance_m", (), np.float64)
-        bigger("direction_w", (3,), np.float64)
-        bigger("visible", (), np.int64)
-        bigger("found", (), np.int64)
-        bigger("observations", (), np.int64)
-        bigger("alive", (), np.bool_)
-        bigger("alias", (), np.int64)
+        move("position_w", (3,), np.float64)
+        move("covariance_w", (3, 3), np.float64)
+        move("descriptor", (32,), np.uint8)
+        move("birth_keyframe", (), np.int64)
+        move("octave", (), np.int64)
+        move("distance_m", (), np.float64)
+        move("direction_w", (3,), np.float64)
+        move("visible", (), np.int64)
+        move("found", (), np.int64)
+        move("observations", (), np.int64)
+        move("alive", (), np.bool_)
+        move("alias", (), np.int64)
 
     position_w: Floats
     covariance_w: Floats
@@ -105,7 +113,7 @@ class LandmarkMap:
         """Give birth to points seen by ``keyframe`` at its keypoints ``feature``; returns their rows."""
         n = len(feature)
         while self.size + n > len(self.alive):
-            self._grow(2 * len(self.alive))
+            self._move(np.arange(self.size), 2 * len(self.alive))
         rows = np.arange(self.size, self.size + n)
         self.size += n
         self.position_w[rows] = position_w
@@ -136,6 +144,35 @@ class LandmarkMap:
         distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
         self.distance_m[rows] = distance
         self.direction_w[rows] = offset / distance[:, None]
+
+    def compact(self) -> Ints | None:
+        """Give away the rows of points that are gone, each time there are twice as many as after
+        the last time; the order of the others stays.
+
+        Returns:
+            What each row is now, -1 where its point is gone, and a last -1 for "none",
+            ``(size + 1,)``: whoever remembers rows must look them up. None where nothing changed.
+        """
+        n = self.size
+        if n < self._compact_at:
+            return None
+        is_kept = np.append(self.alive[:n], False)
+        for keyframe in self.keyframes:
+            is_kept[keyframe.point_ids] = True
+        is_kept[-1] = False
+        kept = np.flatnonzero(is_kept)
+        now = np.full(n + 1, -1, dtype=np.int64)
+        now[kept] = np.arange(len(kept))
+        merged_into = self.resolve(np.arange(n))
+        now[:n] = np.where(is_kept[:n], now[:n], now[merged_into])
+        self.alias[:n] = np.where(merged_into >= 0, merged_into, np.arange(n))
+        self.size = len(kept)
+        self._compact_at = max(_LEAST_ROWS, 2 * self.size)
+        self._move(kept, self._compact_at)
+        self.alias[: self.size] = now[self.alias[: self.size]]
+        for keyframe in self.keyframes:
+            keyframe.point_ids = now[keyframe.point_ids]
+        return now
 
     def resolve(self, rows: Ints) -> Ints:
         """Rows after merges and deaths: -1 where the point is gone."""

@@ -62,15 +62,7 @@ def rescaled(reconstruction: Reconstruction, factor: float) -> Reconstruction:
         trajectory=replace(
             reconstruction.trajectory, T_world_camera=_moved(reconstruction.trajectory.T_world_camera, factor)
         ),
-        keyframes=tuple(
-            replace(
-                keyframe,
-                T_world_camera=_moved(keyframe.T_world_camera, factor),
-                depth_m=keyframe.depth_m * np.float32(factor),
-                depth_scale=keyframe.depth_scale * factor,
-            )
-            for keyframe in reconstruction.keyframes
-        ),
+        keyframes=tuple(keyframe.rescaled(factor) for keyframe in reconstruction.keyframes),
         points_m=reconstruction.points_m * factor,
         scale_votes=tuple(vote + math.log(factor) for vote in reconstruction.scale_votes),
     )

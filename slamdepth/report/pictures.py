@@ -81,7 +81,7 @@ def keyframe_gallery(keyframes: tuple[Keyframe, ...], count: int = 4) -> Gallery
         return None
     spread = np.linspace(0, len(keyframes) - 1, count).round().astype(int)
     chosen = [keyframes[i] for i in sorted(set(spread.tolist()))]
-    known = np.concatenate([k.depth_m[np.isfinite(k.depth_m) & (k.depth_m > 0)][::16] for k in chosen])
+    known = np.concatenate([d[np.isfinite(d) & (d > 0)][::16] for d in (k.depth_m for k in chosen)])
     near_m, far_m = (float(v) for v in np.percentile(known, (1, 98))) if len(known) else (0.0, 1.0)
     start_s = keyframes[0].frame.timestamp_s
     pictures = tuple(_picture(k, start_s, near_m, far_m) for k in chosen)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,13 +15,14 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.registration import CloudOdometry, CloudOdometryConfig, depth_to_cloud
 from slamdepth.geometry import invert, project, transform
+from slamdepth.mapping.keyframe_store import KeyframeStore
 from slamdepth.tracker.checks import check_frame, model_for
+from slamdepth.tracker.final_keyframe import FinalKeyframe
 from slamdepth.tracker.threads import one_blas_thread
 from slamdepth.types import (
     Camera,
     DepthPrediction,
     Frame,
-    Keyframe,
     Reconstruction,
     StepResult,
     TrackingStatus,
@@ -33,6 +35,17 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _COLUMNS = 160  # points across a cloud, whatever the image's size
+
+
+@dataclass
+class _Kept:
+    frame: Frame
+    prediction: DepthPrediction | None
+    T_world_camera: Floats
+
+    def final(self, id: int) -> FinalKeyframe:
+        assert self.prediction is not None
+        return FinalKeyframe.of(id, self.frame, self.prediction, self.T_world_camera, np.zeros((0, 2)))
 
 
 class CloudTracker:
@@ -58,7 +71,8 @@ class CloudTracker:
         self._odometry = CloudOdometry(reach)
         self._times: list[float] = []
         self._poses: list[Floats] = []
-        self._keyframes: list[Keyframe] = []
+        self._keyframes: list[_Kept] = []
+        self._store = KeyframeStore(self.config.map.keyframe_memory_mib)
         self._frames = 0
         self._last_time_s = -np.inf
         self._finished = False
@@ -97,7 +111,8 @@ class CloudTracker:
         self._poses.append(T_world_camera)
         is_keyframe = self._overlap(cloud, T_world_camera) < self.config.tracking.keyframe_overlap
         if is_keyframe:
-            self._keyframes.append(self._keyframe(frame, prediction, T_world_camera))
+            self._keyframes.append(_Kept(frame, prediction, T_world_camera))
+            self._store.tidy(self._keyframes)
         return self._result(frame, T_world_camera, len(cloud), is_keyframe, timings)
 
     def _overlap(self, cloud_c: Floats, T_world_camera: Floats) -> float:
@@ -109,18 +124,6 @@ class CloudTracker:
         inside = (z > 0) & (px >= 0).all(axis=1)
         inside &= (px[:, 0] < self.camera.width) & (px[:, 1] < self.camera.height)
         return float(np.mean(inside))
-
-    def _keyframe(self, frame: Frame, prediction: DepthPrediction, T_world_camera: Floats) -> Keyframe:
-        return Keyframe(
-            id=len(self._keyframes),
-            frame=frame,
-            T_world_camera=T_world_camera,
-            depth_m=prediction.values,
-            sigma_log=prediction.sigma_log,
-            keypoints_px=np.zeros((0, 2)),
-            depth_scale=1.0,
-            prediction=prediction,
-        )
 
     def _result(
         self,
@@ -154,7 +157,7 @@ class CloudTracker:
         self._finished = True
         return Reconstruction(
             trajectory=Trajectory(np.array(self._times), np.stack(self._poses)),
-            keyframes=tuple(self._keyframes),
+            keyframes=tuple(kept.final(i) for i, kept in enumerate(self._keyframes)),
             points_m=self._odometry.local_map_w,
             frames=self._frames,
             tracked=len(self._poses),

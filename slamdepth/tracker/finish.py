@@ -6,14 +6,16 @@ from __future__ import annotations
 import logging
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slamdepth.config import Config
-from slamdepth.depth.alignment import apply_field, log_depth_at
+from slamdepth.depth.alignment import coarse_correction
 from slamdepth.geometry import invert, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.tracker.final_keyframe import FinalKeyframe
 from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.map_adjuster import MapAdjuster
@@ -117,12 +119,11 @@ def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> tuple[float, ...]:
 
 
 def _scale_vote(landmarks: LandmarkMap, keyframe: MapKeyframe) -> float | None:
-    assert keyframe.prediction is not None
     at = np.flatnonzero(keyframe.point_ids >= 0)
     rows = keyframe.point_ids[at]
     at, rows = at[landmarks.observations[rows] >= 3], rows[landmarks.observations[rows] >= 3]
     z = transform(keyframe.T_camera_world, landmarks.position_w[rows])[:, 2]
-    predicted, _ = log_depth_at(keyframe.prediction, keyframe.features.raw_px[at])
+    predicted = keyframe.predicted_log_depth[at]
     ok = (z > 0.05) & np.isfinite(predicted)
     if np.count_nonzero(ok) < 20:
         return None
@@ -145,7 +146,7 @@ def build_reconstruction(
     scale_votes: tuple[float, ...] = (),
 ) -> Reconstruction:
     """The value handed to the user, with every frame placed anew where ``refine_frames``."""
-    # depth images are large, and NumPy makes them in other threads while this one places frames
+    # NumPy and the disk work in other threads while this one places frames
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         making = [pool.submit(_final, keyframe, mapper) for keyframe in landmarks.keyframes]
         if refine_frames:
@@ -170,19 +171,18 @@ def build_reconstruction(
 
 
 def _final(keyframe: MapKeyframe, mapper: LocalMapper) -> Keyframe:
-    prediction = keyframe.prediction
-    assert prediction is not None
-    if prediction.is_sensor:
-        depth_m = prediction.values
-    else:
-        depth_m = apply_field(mapper.depth_field(keyframe), prediction)
-    return Keyframe(
-        id=keyframe.id,
-        frame=keyframe.frame,
-        T_world_camera=invert(keyframe.T_camera_world),
-        depth_m=depth_m,
-        sigma_log=prediction.sigma_log,
-        keypoints_px=keyframe.features.raw_px,
-        depth_scale=keyframe.scale,
-        prediction=prediction,
+    stored = keyframe.prediction
+    assert stored is not None
+    correction = None
+    if not stored.is_sensor:
+        prediction = replace(stored)  # read once, should it lie on disk
+        correction = coarse_correction(mapper.depth_field(keyframe, prediction), prediction)
+    return FinalKeyframe.of(
+        keyframe.id,
+        keyframe.frame,
+        stored,
+        invert(keyframe.T_camera_world),
+        keyframe.features.raw_px,
+        keyframe.scale,
+        correction,
     )

@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 _MIN_MATCHES = 30
 _MAX_GAP_S = 0.2  # frames farther apart say little of the velocity between them
 _NEAREST_M = 0.05
+_PRUNE_AT = 256  # frames, then always twice as many
 _MAX_SHIFT_SHARE = 0.1  # of the scene's distance: a refinement is no relocation
 
 
-@dataclass
+@dataclass(slots=True)
 class _Placed:
     timestamp_s: float
     keyframe: int
@@ -50,9 +51,18 @@ class FrameLog:
         self._camera = camera.without_distortion()
         self._map = landmarks
         self._placed: list[_Placed] = []
+        # rows are remembered as they were numbered then, behind all numbers given away before
+        self._row_now = np.zeros(0, dtype=np.int32)
+        self._prune_at = _PRUNE_AT
 
     def __len__(self) -> int:
         return len(self._placed)
+
+    @property
+    def held_bytes(self) -> int:
+        """Of the arrays."""
+        of_frames = ((p.T_camera_keyframe, p.rows, p.px, p.phase, p.sigma_px) for p in self._placed)
+        return self._row_now.nbytes + sum(array.nbytes for arrays in of_frames for array in arrays)
 
     def add(self, timestamp_s: float, features: Features, placement: Placement, is_keyframe: bool) -> None:
         """Remember where a frame is, relative to a keyframe that sees the same.
@@ -67,19 +77,40 @@ class FrameLog:
         ):
             best = self._map.covisible(placement.point_ids, 1)
             reference = self._map.keyframes[best[0]] if best else reference
-        at = np.flatnonzero(placement.point_ids >= 0)
+        # a keyframe's place is the map's own, whatever it saw
+        at = np.flatnonzero((placement.point_ids >= 0) & (not is_keyframe))
         self._placed.append(
             _Placed(
                 timestamp_s,
                 reference.id,
                 is_keyframe,
                 placement.T_camera_world @ reference.T_world_camera,
-                placement.point_ids[at].astype(np.int32),
+                (placement.point_ids[at] + len(self._row_now)).astype(np.int32),
                 features.px[at].astype(np.float32),
                 row_phase(features.raw_px[at], self._raw_camera).astype(np.float32),
                 features.sigma_px[at].astype(np.float32),
             )
         )
+
+    def renumber(self, now: NDArray[np.int64]) -> None:
+        """Follow the map when it gave its rows away.
+
+        Args:
+            now: as ``LandmarkMap.compact`` returns it.
+        """
+        self._row_now = np.concatenate([now[self._row_now], now[:-1]]).astype(np.int32)
+        if len(self._placed) >= self._prune_at:
+            self._prune()
+            self._prune_at = 2 * len(self._placed)
+
+    def _prune(self) -> None:
+        """Forget what was seen of points that are gone."""
+        for placed in self._placed:
+            rows = self._row_now[placed.rows]
+            kept = rows >= 0
+            placed.rows, placed.px = rows[kept], placed.px[kept]
+            placed.phase, placed.sigma_px = placed.phase[kept], placed.sigma_px[kept]
+        self._row_now = np.zeros(0, dtype=np.int32)
 
     def rescale(self, scales: Floats) -> None:
         """Multiply the metres of each keyframe ``(K,)`` in the frames that hang on it."""
@@ -124,13 +155,14 @@ class FrameLog:
         better, and the frame with them (motion-only bundle adjustment).
         """
         landmarks = self._map
+        row_now = np.concatenate([self._row_now, np.arange(landmarks.size)])
         velocities = [self._velocity(n) for n in range(len(self._placed))] if readout_s else []
         for n, placed in enumerate(self._placed):
             keyframe = landmarks.keyframes[placed.keyframe]
             if placed.is_keyframe:
                 placed.T_camera_keyframe = np.eye(4)
                 continue
-            rows = landmarks.resolve(placed.rows.astype(np.int64))
+            rows = landmarks.resolve(row_now[placed.rows])
             good = np.flatnonzero(rows >= 0)
             good = good[landmarks.observations[rows[good]] >= 2]
             if len(good) < _MIN_MATCHES:

@@ -18,6 +18,7 @@ import numpy as np
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import orthonormalised, rotation_angle_rad
+from slamdepth.mapping.keyframe_store import KeyframeStore
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.frame_log import FrameLog
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _START_KEYFRAMES = 5  # until so many, most points are known by a predicted depth only
+_KNOWN_GROUND = 0.5  # of the points of a keyframe that three see, seen again
 _RESCUE_STEP_M, _RESCUE_TURN_RAD = 0.1, 0.15  # between keyframes without features
 
 
@@ -65,6 +67,9 @@ class Keyframes:
 
     Args:
         watch: measures the stages.
+
+    Attributes:
+        store: where their images lie.
     """
 
     def __init__(
@@ -88,6 +93,8 @@ class Keyframes:
         self._depth = depth
         self._shutter = shutter
         self._timed = watch.timed
+        self.store = KeyframeStore(config.map.keyframe_memory_mib)
+        self._reference: MapKeyframe | None = None  # an earlier keyframe that shows the same
         self._reference_overlap = 0.0
         self._still = 0
         self._seen_share = 1.0  # of what the last keyframe knew, when its own points were born
@@ -99,8 +106,12 @@ class Keyframes:
         return self._waiting is not None
 
     def wants(self, placement: Placement) -> bool:
-        """The view has moved on when much of what the last keyframe saw is seen no more."""
-        reference = self._map.keyframes[-1]
+        """The view has moved on when much of what the reference saw is seen no more.
+
+        The reference is the last keyframe, or on known ground an earlier one that shows the same:
+        going back and forth makes no new ones (after ORB-SLAM's reference keyframe).
+        """
+        reference = self._reference or self._map.keyframes[-1]
         seen = np.zeros(self._map.size + 1, dtype=bool)
         seen[placement.point_ids] = True
         seen[-1] = False
@@ -116,8 +127,22 @@ class Keyframes:
         starting = len(self._map.keyframes) < _START_KEYFRAMES
         enough = tracking.keyframe_overlap_start if starting else tracking.keyframe_overlap
         if still < enough * self._reference_overlap:
-            return True
+            return starting or not self._is_known_ground(placement)
         return placement.inliers < tracking.keyframe_min_inliers and still < 0.9 * self._reference_overlap
+
+    def _is_known_ground(self, placement: Placement) -> bool:
+        """Whether an earlier keyframe shows what the frame sees; the best such one is the reference then."""
+        earlier = len(self._map.keyframes) - self._config.loops.min_gap
+        if earlier <= 0 or placement.inliers < self._config.tracking.keyframe_min_inliers:
+            return False
+        shared = self._map.shared_points(placement.point_ids)[:earlier]
+        best = self._map.keyframes[int(np.argmax(shared))]
+        rows = best.point_ids[best.point_ids >= 0]
+        known = int(np.count_nonzero(self._map.observations[rows] >= 3))
+        if shared[best.id] < _KNOWN_GROUND * known:
+            return False
+        self._reference, self._reference_overlap = best, float(shared[best.id])
+        return True
 
     def _has_moved_on(self, placement: Placement, reference: MapKeyframe) -> bool:
         D = placement.T_camera_world @ reference.T_world_camera
@@ -131,6 +156,7 @@ class Keyframes:
             keyframe = self._mapper.insert(
                 frame, features, placement.T_camera_world, placement.point_ids, velocity
             )
+        self._reference = None
         self._reference_overlap, self._still, self._seen_share = 0.0, 0, 1.0
         # the first few are waited for: all that follows stands on the points born there
         at_once = self._depth.is_instant(frame) or len(self._map.keyframes) <= _START_KEYFRAMES
@@ -188,7 +214,8 @@ class Keyframes:
                 self._mapper.adjust_window(keyframe)
         with self._timed("mapping"):
             self._mapper.cull(keyframe)
+            self.store.tidy(self._map.keyframes)
         if self._reference_overlap > 0:
             self._seen_share = max(self._still / self._reference_overlap, 0.1)
-        self._reference_overlap = 0.0
+        self._reference, self._reference_overlap = None, 0.0
         return moved

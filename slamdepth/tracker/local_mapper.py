@@ -90,7 +90,8 @@ class LocalMapper:
             keyframe.log_depth, keyframe.sigma_log = depth, sigma
         else:
             log, doubt = prior_log_depth_at(prediction, features.raw_px)
-            correction, sigma = self.depth_field(keyframe).correction(
+            keyframe.predicted_log_depth = depth
+            correction, sigma = self.depth_field(keyframe, keyframe.prediction).correction(
                 features.raw_px, np.nan_to_num(log), np.nan_to_num(doubt, nan=1.0)
             )
             keyframe.scale = float(np.exp(np.median(correction)))
@@ -107,9 +108,8 @@ class LocalMapper:
         R = T_world_camera[:3, :3]
         self._map.add_points(keyframe, born, transform(T_world_camera, position_c), R @ covariance_c @ R.T)
 
-    def depth_field(self, keyframe: MapKeyframe) -> DepthField:
-        """The keyframe's prediction tied to the well-known points it sees."""
-        assert keyframe.prediction is not None
+    def depth_field(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> DepthField:
+        """The keyframe's ``prediction`` tied to the well-known points it sees."""
         seen = np.flatnonzero(keyframe.point_ids >= 0)
         rows = keyframe.point_ids[seen]
         multi = self._map.observations[rows] >= 2
@@ -118,7 +118,7 @@ class LocalMapper:
         ok = z > 0.05
         seen, rows, z = seen[ok], rows[ok], z[ok]
         raw = keyframe.features.raw_px[seen]
-        log_predicted, sigma = prior_log_depth_at(keyframe.prediction, raw)
+        log_predicted, sigma = prior_log_depth_at(prediction, raw)
         return fit_depth_field(
             raw,
             log_predicted,

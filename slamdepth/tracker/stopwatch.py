@@ -8,15 +8,14 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
-
 
 class Stopwatch:
     """Milliseconds by the name of the stage, for the frame at hand and on average."""
 
     def __init__(self) -> None:
         self.frame_ms: dict[str, float] = {}
-        self._all_ms: dict[str, list[float]] = defaultdict(list)
+        self._total_ms: dict[str, float] = defaultdict(float)
+        self._times: dict[str, int] = defaultdict(int)
 
     def next_frame(self) -> None:
         """Begin with another frame; what was handed out stays as it is."""
@@ -34,8 +33,9 @@ class Stopwatch:
     def add(self, stage: str, ms: float) -> None:
         """Count time that was measured elsewhere."""
         self.frame_ms[stage] = self.frame_ms.get(stage, 0.0) + ms
-        self._all_ms[stage].append(ms)
+        self._total_ms[stage] += ms
+        self._times[stage] += 1
 
     def mean_ms(self) -> dict[str, float]:
         """Mean over all times a stage was measured."""
-        return {stage: float(np.mean(values)) for stage, values in self._all_ms.items()}
+        return {stage: total / self._times[stage] for stage, total in self._total_ms.items()}

@@ -20,6 +20,7 @@ from slamdepth.tracker.checks import check_frame, model_for
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.finish import build_reconstruction, optimise_everything
 from slamdepth.tracker.frame_log import FrameLog
+from slamdepth.tracker.held import HeldBytes, held_bytes
 from slamdepth.tracker.keyframes import Keyframes, Moved
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Localiser, Placement
@@ -144,6 +145,7 @@ class Tracker:
         self._keyframes.count_frame()
         if self._keyframes.is_due:
             self._join()
+        self._forget_points()
         with self._watch.timed("tracking"):
             features = self._still(frame, plain)
             placement, status = self._place(frame, features)
@@ -200,6 +202,14 @@ class Tracker:
         if moved is not None and self._last is not None:
             self._last = replace(self._last, T_camera_world=moved.carry(self._last.T_camera_world))
         return moved
+
+    def _forget_points(self) -> None:
+        """Let the map give away the rows of points that are gone; nobody else remembers rows by now."""
+        now = self._map.compact()
+        if now is not None:
+            self._log.renumber(now)
+            if self._last is not None:
+                self._last = replace(self._last, point_ids=now[self._last.point_ids])
 
     def _place_again(self, features: Features, placement: Placement) -> Placement:
         """Place a frame in the map that its keyframe's depth has just made larger."""
@@ -317,6 +327,10 @@ class Tracker:
     def _depth_of(self, frame: Frame) -> DepthPrediction:
         with self._watch.timed("depth"):
             return self._depth.take(frame)
+
+    def held(self) -> HeldBytes:
+        """How much memory keyframes, points and frames take by now."""
+        return held_bytes(self._map, self._log, self._keyframes.store)
 
     def _remember_motion(self, frame: Frame, measured: Placement, final: Placement) -> None:
         """Velocity from the pose as measured, so that a correction of the map is not taken for motion."""
