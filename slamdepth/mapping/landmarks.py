@@ -64,6 +64,7 @@ class LandmarkMap:
     def __init__(self) -> None:
         self.keyframes: list[MapKeyframe] = []
         self.size = 0
+        self.descriptor = np.zeros((0, 0), np.uint8)
         self._grow(4096)
 
     def _grow(self, capacity: int) -> None:
@@ -75,7 +76,7 @@ class LandmarkMap:
 
         bigger("position_w", (3,), np.float64)
         bigger("covariance_w", (3, 3), np.float64)
-        bigger("descriptor", (32,), np.uint8)
+        bigger("descriptor", self.descriptor.shape[1:], self.descriptor.dtype)
         bigger("birth_keyframe", (), np.int64)
         bigger("octave", (), np.int64)
         bigger("distance_m", (), np.float64)
@@ -88,7 +89,7 @@ class LandmarkMap:
 
     position_w: Floats
     covariance_w: Floats
-    descriptor: NDArray[np.uint8]
+    descriptor: NDArray[Any]
     birth_keyframe: Ints
     octave: Ints
     distance_m: Floats
@@ -106,6 +107,9 @@ class LandmarkMap:
         n = len(feature)
         while self.size + n > len(self.alive):
             self._grow(2 * len(self.alive))
+        if self.size == 0:  # the first points tell what a descriptor is
+            kind = keyframe.features.descriptors
+            self.descriptor = np.zeros((len(self.alive), *kind.shape[1:]), kind.dtype)
         rows = np.arange(self.size, self.size + n)
         self.size += n
         self.position_w[rows] = position_w
