@@ -33,7 +33,8 @@ class AlikedExtractor:
 
     Its graph takes ``image`` ``(1, 3, rows, columns)`` and gives ``keypoints`` ``(N, 2)``, -1 to 1 from
     the centre of the first pixel to that of the last, ``descriptors`` ``(N, 128)`` and ``scores`` ``(N,)``.
-    An image is filled up to the input's shape, not stretched.
+    An image is filled up to the input's shape, not stretched. The thresholds are guesses: no published
+    file was at hand to measure them with.
 
     Raises:
         WeightsError: the file is missing, unreadable or another network.
