@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,9 @@ from slamdepth.types import Camera
 
 SENSOR = "sensor"
 NONE = "none"
+OURS = "slamdepth"
+FILES = {"weights", "matcher"}
+"""Settings of a feature that name a file."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,14 @@ class Row:
     def is_ours(self) -> bool:
         return self.system.startswith("slamdepth")
 
+    def published(self) -> dict[str, Any]:
+        """What the table's file says of the row: of weights files only the names."""
+        row = asdict(self)
+        del row["note"]
+        for key in FILES & row["settings"].get("features", {}).keys():
+            row["settings"]["features"][key] = Path(row["settings"]["features"][key]).name
+        return row
+
     @property
     def needs_sensor(self) -> bool:
         return self.depth == SENSOR
@@ -50,7 +61,7 @@ class Row:
 
 
 def _ours(depths: Sequence[str]) -> list[Row]:
-    return [Row("slamdepth", "slamdepth", depth) for depth in depths]
+    return [Row("slamdepth", OURS, depth) for depth in depths]
 
 
 def _ours_icp(depths: Sequence[str]) -> list[Row]:
@@ -74,7 +85,7 @@ def _kiss_icp(depths: Sequence[str]) -> list[Row]:
 
 
 SYSTEMS: dict[str, Callable[[Sequence[str]], list[Row]]] = {
-    "slamdepth": _ours,
+    OURS: _ours,
     "slamdepth-icp": _ours_icp,
     "orbslam3": _orbslam3,
     "open3d": _open3d,
@@ -105,8 +116,13 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 """Our own parts, one changed at a time: settings over the defaults."""
 
 
-def plan_rows(systems: Sequence[str], depths: Sequence[str]) -> list[Row]:
+def plan_rows(
+    systems: Sequence[str], depths: Sequence[str], features: Sequence[dict[str, Any]] = ()
+) -> list[Row]:
     """The rows of ``systems`` for ``depths``, in the order given.
+
+    Args:
+        features: settings of each feature that slamdepth is run with; none takes the default.
 
     Raises:
         ConfigError: no such system; lists those that exist.
@@ -115,15 +131,25 @@ def plan_rows(systems: Sequence[str], depths: Sequence[str]) -> list[Row]:
     for name in systems:
         if name not in SYSTEMS:
             raise ConfigError(f"--systems: no system is called '{name}'; known: {', '.join(SYSTEMS)}")
-        rows += SYSTEMS[name](depths)
+        of_system = SYSTEMS[name](depths)
+        if name == OURS and features:
+            of_system = [with_feature(row, settings) for row in of_system for settings in features]
+        rows += of_system
     return rows
+
+
+def with_feature(row: Row, settings: dict[str, Any]) -> Row:
+    """slamdepth's row with other features; the default ones go without saying."""
+    if settings == {"name": Config().features.name}:
+        return row
+    return replace(row, label=f"{row.label}, {settings['name']}", settings={"features": settings})
 
 
 def plan_ablation(depths: Sequence[str]) -> list[Row]:
     """slamdepth with one part changed at a time; what is the default anyway is left out."""
     rows = []
     for depth in depths:
-        shipped, *others = (Row(label, "slamdepth", depth, s) for label, s in ABLATIONS.items())
+        shipped, *others = (Row(label, OURS, depth, s) for label, s in ABLATIONS.items())
         rows += [shipped, *(row for row in others if config_of(row) != config_of(shipped))]
     return rows
 

@@ -24,6 +24,7 @@ from benchmarks.rows import ABLATIONS, NONE, SENSOR, SYSTEMS, Row, config_of, pl
 from benchmarks.summary import FORMAT, environment, read_benchmark, summarise
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.errors import CameraError, ConfigError, DatasetError, SlamdepthError
+from slamdepth.frontend.features import create_extractor, needs_weights
 from slamdepth.io import write_json, write_text
 
 _BUSY = 0.5
@@ -141,6 +142,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--sequences", type=_names, help="their names, with commas (default: all in --data)")
     add("--systems", type=_names, default=list(SYSTEMS), help=f"with commas, of: {', '.join(SYSTEMS)}")
     add("--depth", type=_names, default=[SENSOR, "dinov2"], help="'sensor' and names of depth models")
+    add("--features", type=_names, default=[], help="features slamdepth is run with, with commas: orb,sift")
+    add("--features-weights", type=Path, help="ONNX file of those that are a network: aliked")
+    add("--features-matcher", type=Path, help="LightGlue's ONNX file for it")
     add("--runs", type=int, default=1, help="runs of each row; the table holds medians")
     add("--ablation", action="store_true", help="instead: slamdepth with one part changed at a time")
     add("--pace", choices=("sequence", "fast"), default="sequence",
@@ -159,7 +163,7 @@ def make_plan(options: argparse.Namespace) -> Plan:
     """Check everything that can be checked before hours are spent.
 
     Raises:
-        InputError: a sequence, a system or a depth does not exist.
+        InputError: a sequence, a system, a depth or a feature does not exist.
     """
     from platformdirs import user_cache_dir
 
@@ -172,10 +176,15 @@ def make_plan(options: argparse.Namespace) -> Plan:
             )
     if options.runs < 1:
         raise ConfigError(f"--runs: at least 1, got {options.runs}")
-    rows = plan_ablation(options.depth) if options.ablation else plan_rows(options.systems, options.depth)
+    if options.ablation:
+        if options.features:
+            raise ConfigError("--features: not together with --ablation, which has rows of its own")
+        rows = plan_ablation(options.depth)
+    else:
+        rows = plan_rows(options.systems, options.depth, _features(options))
     for row in rows:
         if row.is_ours:
-            config_of(row)
+            create_extractor(config_of(row).features)
     if options.vocabulary and not options.vocabulary.is_file():
         raise ConfigError(f"{options.vocabulary}: no such vocabulary file")
     sequences = find_sequences(options.data, options.sequences)
@@ -191,6 +200,13 @@ def make_plan(options: argparse.Namespace) -> Plan:
         training_images(options.data, sequences.values()),
         options.timeout,
     )
+
+
+def _features(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Settings of each feature asked for, with the files for those that are networks."""
+    files = {"weights": options.features_weights, "matcher": options.features_matcher}
+    given = {key: str(path.resolve()) for key, path in files.items() if path is not None}
+    return [{"name": name, **(given if needs_weights(name) else {})} for name in options.features]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,7 @@ def summarise(sequence: str, row: Row, results: Sequence[Mapping[str, Any]]) -> 
         notes.append(f"{len(bad)} of {len(results)} runs failed: {'; '.join(messages)}")
     return {
         "sequence": sequence,
-        **{key: value for key, value in asdict(row).items() if key != "note"},
+        **row.published(),
         "status": "ok" if good else (str(bad[0]["status"]) if bad else "left out"),
         "message": "" if good else "; ".join(messages),
         "runs": [dict(result) for result in results],

@@ -23,13 +23,17 @@ class _Section(BaseModel):
 
 
 class FeatureConfig(_Section):
-    """Keypoints and descriptors."""
+    """Keypoints and descriptors; other features than ORB have levels and thresholds of their own."""
 
     name: str = Field("orb", description="feature by its registered name")
     count: int = Field(1000, ge=100, le=10000, description="keypoints kept per frame")
-    levels: int = Field(8, ge=1, le=12, description="pyramid levels")
-    scale_factor: float = Field(1.2, gt=1.0, le=2.0, description="ratio of one level to the next")
+    levels: int = Field(8, ge=1, le=12, description="pyramid levels of ORB")
+    scale_factor: float = Field(1.2, gt=1.0, le=2.0, description="ratio of one level of ORB to the next")
     fast_threshold: int = Field(7, ge=1, le=100, description="lowest FAST contrast, grey values")
+    weights: str | None = Field(None, min_length=1, description="ONNX file of a feature that is a network")
+    matcher: str | None = Field(
+        None, min_length=1, description="LightGlue's ONNX file for it, to match whole images with"
+    )
 
 
 class TrackingConfig(_Section):
@@ -99,6 +103,9 @@ class DepthConfig(_Section):
 
 GROUND_TRUTH = "groundtruth"
 """The word that takes the scale from what a sequence is judged by."""
+
+_FILES = (("depth", "weights"), ("scale", "depth"), ("features", "weights"), ("features", "matcher"))
+"""Settings that may name a file."""
 
 
 class ScaleConfig(_Section):
@@ -178,6 +185,13 @@ class Config(_Section):
     scale: ScaleConfig = ScaleConfig()
     map: MapConfig = MapConfig()
 
+    @model_validator(mode="after")
+    def _features_are_used(self) -> Config:
+        chosen = (self.features.name, self.features.weights, self.features.matcher)
+        if self.odometry == "kiss-icp" and chosen != (FeatureConfig().name, None, None):
+            raise ValueError("odometry 'kiss-icp' uses no features: leave out their name and weights")
+        return self
+
     @classmethod
     def from_yaml(cls, path: str | Path, overrides: dict[str, Any] | None = None) -> Config:
         """Read ``path`` and lay ``overrides`` (nested dicts) over it.
@@ -221,7 +235,7 @@ class Config(_Section):
 
     def _with_files(self, named: Callable[[str], str]) -> dict[str, Any]:
         values = self.model_dump(mode="json")
-        for section, key in (("depth", "weights"), ("scale", "depth")):
+        for section, key in _FILES:
             if isinstance(value := values[section][key], str) and value != GROUND_TRUTH:
                 values[section][key] = named(value)
         return values
@@ -249,4 +263,5 @@ def _first_problem(error: ValidationError) -> str:
             assert issubclass(annotation, BaseModel)
             section = annotation
         return f"unknown setting '{name}'; allowed here: {', '.join(sorted(section.model_fields))}"
-    return f"setting '{name}': {problem['msg'].removeprefix('Value error, ')} (got {problem['input']!r})"
+    message = str(problem["msg"]).removeprefix("Value error, ")
+    return f"setting '{name}': {message} (got {problem['input']!r})" if name else message

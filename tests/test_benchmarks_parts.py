@@ -86,6 +86,18 @@ def test_the_naive_row_is_fed_predictions_and_says_so() -> None:
     assert not plan_rows(["slamdepth"], ["dinov2"])[0].needs_predictions
 
 
+def test_each_feature_is_a_row_of_ours_and_of_nobody_else() -> None:
+    features = [{"name": "orb"}, {"name": "sift"}, {"name": "aliked", "weights": "/home/me/aliked.onnx"}]
+    rows = plan_rows(["slamdepth", "kiss-icp"], ["sensor"], features)
+    assert [row.label for row in rows] == ["slamdepth", "slamdepth, sift", "slamdepth, aliked", "KISS-ICP"]
+    assert rows[:1] + rows[3:] == plan_rows(["slamdepth", "kiss-icp"], ["sensor"])
+    assert [config_of(row).features.name for row in rows[:3]] == ["orb", "sift", "aliked"]
+    assert config_of(rows[2]).features.weights == "/home/me/aliked.onnx"
+    published = summarise("room", rows[2], [])
+    assert published["settings"] == {"features": {"name": "aliked", "weights": "aliked.onnx"}}
+    assert config_of(rows[2]).features.weights == "/home/me/aliked.onnx"
+
+
 def test_an_unknown_setting_of_a_row_is_named() -> None:
     with pytest.raises(ConfigError, match=r"row 'odd': unknown setting 'loops\.on'"):
         config_of(Row("odd", "slamdepth", "sensor", {"loops": {"on": True}}))

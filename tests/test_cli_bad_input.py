@@ -129,6 +129,19 @@ BAD_CALLS = {
     "unknown command": (("rum", "SEQ"), "No such command 'rum'"),
     "unknown depth model": ((*RUN, "--depth", "kinect"), "unknown depth model 'kinect'; choose from: "),
     "unknown odometry": ((*RUN, "--odometry", "wheels"), "'orb' or 'kiss-icp'"),
+    "unknown feature": (
+        (*RUN, "--features", "surf"),
+        "no feature is called 'surf'; known: akaze, aliked, brisk, orb, sift",
+    ),
+    "features without a file": ((*RUN, "--features", "aliked"), "with --features-weights FILE"),
+    "features with a wrong file": (
+        (*RUN, "--features", "aliked", "--features-weights", "FILE"),
+        "not a readable ONNX file",
+    ),
+    "features not used": (
+        (*RUN, "--odometry", "kiss-icp", "--features", "sift"),
+        "command line: odometry 'kiss-icp' uses no features",
+    ),
     "unknown device": ((*RUN, "--device", "tpu"), "'cpu' or 'cuda'"),
     "no number": ((*RUN, "--max-frames", "many"), "Invalid value for '--max-frames'"),
     "stride 0": ((*RUN, "--stride", "0"), "Invalid value for '--stride'"),

@@ -1,32 +1,61 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Features: how many, where, and the same each time."""
+"""What every feature promises: how many, where, how sure, and the same each time."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from feature_networks import write_aliked
 
 from slamdepth.config import FeatureConfig
-from slamdepth.errors import ConfigError
-from slamdepth.frontend.features import Features, create_extractor, spread
+from slamdepth.errors import ConfigError, TrackingError, WeightsError
+from slamdepth.frontend.features import (
+    FeatureExtractor,
+    Features,
+    ScaleLevels,
+    create_extractor,
+    feature_names,
+    feature_weights,
+    register_extractor,
+    spread,
+)
+from slamdepth.frontend.metric import Hamming, UnitL2
 from slamdepth.types import Camera
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 
 
-def picture(seed: int = 0) -> np.ndarray:
+def picture(seed: int = 0, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
     """Strong texture in one corner and weak texture elsewhere, as rooms have."""
     rng = np.random.default_rng(seed)
-    noise = cv2.GaussianBlur(rng.normal(size=(240, 320)), (0, 0), 1.5)
+    noise = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), 1.5)
     noise /= noise.std()
-    contrast = np.full((240, 320), 12.0)
+    contrast = np.full(shape, 12.0)
     contrast[:100, :120] = 60.0
     return np.clip(128 + contrast * noise, 0, 255).astype(np.uint8)
 
 
-def extract(gray: np.ndarray, **settings: object) -> Features:
-    return create_extractor(FeatureConfig(**{"count": 300, **settings})).extract(gray, CAMERA)
+@pytest.fixture(scope="session")
+def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_aliked(tmp_path_factory.mktemp("networks") / "aliked.onnx")
+
+
+@pytest.fixture(params=feature_names())
+def extractor(request: pytest.FixtureRequest, network: Path) -> FeatureExtractor:
+    """Every feature that this OpenCV can make."""
+    weights = str(network) if request.param == "aliked" else None
+    try:
+        return create_extractor(FeatureConfig(name=request.param, count=300, weights=weights))
+    except ConfigError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
+def orb() -> FeatureExtractor:
+    return create_extractor(FeatureConfig(count=300))
 
 
 def occupancy(px: np.ndarray, cell: int = 20) -> float:
@@ -34,65 +63,165 @@ def occupancy(px: np.ndarray, cell: int = 20) -> float:
     return len(cells) / ((240 // cell) * (320 // cell))
 
 
-def test_count_shapes_and_types() -> None:
-    features = extract(picture())
+def test_count_shapes_and_types(extractor: FeatureExtractor) -> None:
+    features = extractor.extract(picture(), CAMERA)
     n = len(features)
-    assert 250 <= n <= 300
+    assert 150 <= n <= 300
     assert features.raw_px.shape == features.px.shape == (n, 2)
     assert features.px.dtype == features.raw_px.dtype == np.float64
-    assert features.descriptors.shape == (n, 32)
-    assert features.descriptors.dtype == np.uint8
     assert features.octave.shape == features.sigma_px.shape == (n,)
     assert features.octave.min() >= 0
-    assert features.octave.max() < 8
-    np.testing.assert_allclose(features.sigma_px, 1.2**features.octave)
-    assert (features.raw_px >= 0).all()
-    assert (features.raw_px < [320, 240]).all()
+    assert features.octave.max() < extractor.levels.count
+    assert (features.raw_px >= -0.5).all()
+    assert (features.raw_px < [319.5, 239.5]).all()
+    assert features.descriptors.flags.c_contiguous
+    assert len(np.unique(features.raw_px, axis=0)) > 0.9 * n
 
 
-def test_spread_wider_than_opencv_does() -> None:
-    gray = picture()
-    ours = occupancy(extract(gray).raw_px)
-    own = cv2.ORB_create(nfeatures=300, fastThreshold=7).detect(gray, None)
-    theirs = occupancy(np.array([k.pt for k in own]))
-    assert ours > 1.3 * theirs
+def test_descriptors_are_what_the_metric_compares(extractor: FeatureExtractor) -> None:
+    features = extractor.extract(picture(), CAMERA)
+    metric, descriptors = features.metric, features.descriptors
+    assert metric.empty().dtype == descriptors.dtype
+    assert metric.empty().shape[1:] == descriptors.shape[1:]
+    assert metric.between(descriptors, descriptors).max() <= 1
+    apart = metric.between(descriptors[:-1], descriptors[1:])
+    assert np.median(apart) > metric.max_distance > metric.strict_distance > 0
+    if descriptors.dtype == np.float32:
+        np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1.0, atol=1e-4)
 
 
-def test_deterministic() -> None:
-    first, second = extract(picture()), extract(picture())
+def test_larger_keypoints_are_less_sure(extractor: FeatureExtractor) -> None:
+    features = extractor.extract(picture(), CAMERA)
+    np.testing.assert_allclose(features.sigma_px, extractor.levels.sigma_px(features.octave))
+    sigma = extractor.levels.sigma_px(np.arange(extractor.levels.count))
+    assert (np.diff(sigma) > 0).all()
+    assert 0.3 < sigma[0] < 2.0
+
+
+def test_weak_texture_gets_its_share(extractor: FeatureExtractor) -> None:
+    px = extractor.extract(picture(), CAMERA).raw_px
+    is_strong = (px < [120, 100]).all(axis=1)
+    assert 0.05 < np.mean(is_strong) < 0.5
+
+
+def test_orb_spreads_wider_than_opencv_does(orb: FeatureExtractor) -> None:
+    ours = occupancy(orb.extract(picture(), CAMERA).raw_px)
+    own = cv2.ORB_create(nfeatures=300, fastThreshold=7).detect(picture(), None)
+    assert ours > 1.3 * occupancy(np.array([k.pt for k in own]))
+
+
+def test_deterministic(extractor: FeatureExtractor) -> None:
+    first = extractor.extract(picture(), CAMERA)
+    extractor.extract(picture(1), CAMERA)  # nothing stays behind of an earlier image
+    second = extractor.extract(picture(), CAMERA)
     np.testing.assert_array_equal(first.raw_px, second.raw_px)
     np.testing.assert_array_equal(first.descriptors, second.descriptors)
-    extractor = create_extractor(FeatureConfig(count=300))
-    extractor.extract(picture(1), CAMERA)  # nothing stays behind of an earlier image
-    np.testing.assert_array_equal(extractor.extract(picture(), CAMERA).descriptors, first.descriptors)
 
 
 @pytest.mark.parametrize("grey", [0, 127, 255])
-def test_a_blank_image_has_none(grey: int) -> None:
-    features = extract(np.full((240, 320), grey, np.uint8))
+def test_a_blank_image_has_none(extractor: FeatureExtractor, grey: int) -> None:
+    features = extractor.extract(np.full((240, 320), grey, np.uint8), CAMERA)
     assert len(features) == 0
     assert features.px.shape == (0, 2)
-    assert features.descriptors.shape == (0, 32)
-    assert features.sigma_px.shape == (0,)
+    assert features.descriptors.shape == features.metric.empty().shape
+    assert features.octave.shape == features.sigma_px.shape == (0,)
+    assert features.place_descriptors.shape == (0, 32)
 
 
-def test_an_image_too_small_for_a_patch_has_none() -> None:
+def test_an_image_too_small_for_a_patch_has_none(orb: FeatureExtractor) -> None:
     camera = Camera(24, 20, 20, 20, 11.5, 9.5)
     gray = np.random.default_rng(0).integers(0, 256, (20, 24), dtype=np.uint8)
-    assert len(create_extractor(FeatureConfig()).extract(gray, camera)) == 0
+    assert len(orb.extract(gray, camera)) == 0
 
 
-def test_pixels_are_undistorted() -> None:
+def test_pixels_are_undistorted(extractor: FeatureExtractor) -> None:
     camera = Camera(320, 240, 260, 260, 159.5, 119.5, (0.1, 0.02, 0.001, -0.001, 0.0))
-    features = create_extractor(FeatureConfig(count=300)).extract(picture(), camera)
+    features = extractor.extract(picture(), camera)
     np.testing.assert_allclose(features.px, camera.undistort_points(features.raw_px))
     assert np.abs(features.px - features.raw_px).max() > 1.0
-    np.testing.assert_array_equal(features.raw_px, extract(picture()).raw_px)
+    np.testing.assert_array_equal(features.raw_px, extractor.extract(picture(), CAMERA).raw_px)
+
+
+def test_a_moved_picture_is_matched_with_itself(extractor: FeatureExtractor) -> None:
+    """By 8 rows and 16 columns: what is at one pixel of the one is there in the other."""
+    wide = picture(shape=(248, 336))
+    a, b = extractor.extract(wide[:240, :320], CAMERA), extractor.extract(wide[8:, 16:], CAMERA)
+    i, j = a.match(b, np.arange(len(a)), ratio=0.85)
+    assert len(i) > 40
+    off = np.linalg.norm(a.px[i] - [16, 8] - b.px[j], axis=1)
+    assert np.mean(off < 1.5) > 0.8
+    assert np.median(off) < 1.0
+
+
+def test_places_are_recognised_by_orb(extractor: FeatureExtractor, orb: FeatureExtractor) -> None:
+    expected = orb.extract(picture(), CAMERA).descriptors
+    features = extractor.extract(picture(), CAMERA)
+    np.testing.assert_array_equal(features.place_descriptors, expected)
+    np.testing.assert_array_equal(features.place_descriptors, expected)  # also when the image is gone
+
+
+def test_a_level_is_the_nearest_size() -> None:
+    levels = ScaleLevels(2.0, 3, growth=0.5)
+    np.testing.assert_array_equal(
+        levels.of(np.array([0.3, 1.0, 1.4, 1.5, 2.0, 4.0, 9.0])), [0, 0, 0, 1, 1, 2, 3]
+    )
+    np.testing.assert_allclose(levels.sigma_px(np.arange(3)), [1.0, np.sqrt(2.0), 2.0])
+
+
+def test_matching_keeps_to_the_keypoints_asked_for(orb: FeatureExtractor) -> None:
+    features = orb.extract(picture(), CAMERA)
+    among = np.arange(3, len(features), 7)
+    i, j = features.match(features, among, ratio=0.85)
+    np.testing.assert_array_equal(among[i], j)
+    assert len(i) > 0.9 * len(among)
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.zeros((2, 31), np.uint8), np.zeros((2, 32), np.float32), np.zeros((3, 32), np.uint8)]
+)
+def test_descriptors_of_another_metric_are_refused(wrong: np.ndarray) -> None:
+    px = np.zeros((2, 2))
+    with pytest.raises(TrackingError, match=r"2 keypoints need descriptors \(2, 32\) uint8, got"):
+        Features(px, px, np.zeros(2, np.int64), np.ones(2), wrong)
+    assert len(
+        Features(px, px, np.zeros(2, np.int64), np.ones(2), wrong[:2, :31].astype(np.uint8), Hamming(31))
+    )
+    Features(
+        px[:0], px[:0], np.zeros(0, np.int64), np.ones(0), UnitL2(5, 1.0, 0.5).empty(), UnitL2(5, 1.0, 0.5)
+    )
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match=r"no feature is called 'surf'; known: .*orb"):
+    with pytest.raises(
+        ConfigError, match=r"no feature is called 'surf'; known: akaze, aliked, brisk, orb, sift"
+    ):
         create_extractor(FeatureConfig(name="surf"))
+
+
+def test_what_opencv_lacks_says_which_package_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (cv2, getattr(cv2, "xfeatures2d", None)):
+        for name in ("BRISK", "ALIKED"):
+            monkeypatch.delattr(module, name, raising=False)
+    with pytest.raises(ConfigError, match=r"'brisk' is not in this OpenCV .*opencv-contrib-python-headless"):
+        create_extractor(FeatureConfig(name="brisk"))
+
+
+def test_weights_files_are_asked_for_where_they_are_needed(tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match="'aliked' is a network: name its ONNX file with --features-weights"
+    ):
+        create_extractor(FeatureConfig(name="aliked"))
+    with pytest.raises(ConfigError, match=r"'sift' takes no weights file; leave out some\.onnx"):
+        create_extractor(FeatureConfig(name="sift", weights="some.onnx"))
+    with pytest.raises(WeightsError, match=r"none\.onnx: no such file with weights of feature 'aliked'"):
+        create_extractor(FeatureConfig(name="aliked", weights=str(tmp_path / "none.onnx")))
+    assert feature_weights(FeatureConfig()) == ()
+
+
+def test_two_features_of_one_name_are_refused() -> None:
+    feature_names()
+    with pytest.raises(ConfigError, match="two features are called 'orb'"):
+        register_extractor("orb")(lambda config: create_extractor(config))
 
 
 def test_the_best_of_every_cell_comes_first() -> None:

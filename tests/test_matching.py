@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slamdepth.frontend.matching import PixelGrid, best_matches, hamming, hamming_table, match_all
+from slamdepth.frontend.matching import PixelGrid, best_matches, match_all
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -26,17 +26,7 @@ def flip(rows: np.ndarray, bits: int, seed: int = 0) -> np.ndarray:
     return np.packbits(unpacked, axis=1)
 
 
-def test_hamming_counts_bits() -> None:
-    a, b = descriptors(7), descriptors(5, 1)
-    slow = (np.unpackbits(a, axis=1)[:, None] != np.unpackbits(b, axis=1)[None]).sum(axis=2)
-    np.testing.assert_array_equal(hamming_table(a, b), slow)
-    np.testing.assert_array_equal(hamming(a[:5], b), np.diag(slow[:5]))
-    np.testing.assert_array_equal(hamming(a, a), 0)
-    np.testing.assert_array_equal(hamming(a, ~a), 256)
-    assert hamming_table(a[:0], b).shape == (0, 5)
-    assert hamming(a[:0], b[:0]).shape == (0,)
-
-
+@settings(deadline=None)
 @given(seeds, st.integers(0, 25), st.integers(0, 25), st.sampled_from([1.0, 8.0, 40.0, 2000.0]))
 def test_pairs_within_is_brute_force(seed: int, m: int, n: int, reach: float) -> None:
     rng = np.random.default_rng(seed)
@@ -72,6 +62,7 @@ def test_small_radii_over_a_large_image_need_no_large_grid() -> None:
     assert (q.tolist(), t.tolist()) == ([0], [0])
 
 
+@settings(deadline=None)
 @given(seeds, st.integers(1, 60))
 def test_best_matches_is_one_to_one_and_near(seed: int, pairs: int) -> None:
     rng = np.random.default_rng(seed)

@@ -64,6 +64,19 @@ def run_command(
         str | None,
         typer.Option(metavar="orb|kiss-icp", help="What estimates the motion. Default: orb"),
     ] = None,
+    features: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="Keypoints: orb, sift, ...; an unknown name lists all. Default: orb"
+        ),
+    ] = None,
+    features_weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="ONNX file of features that are a network: aliked.")
+    ] = None,
+    features_matcher: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="LightGlue's ONNX file, to match whole images with."),
+    ] = None,
     camera: CameraOption = None,
     readout_ms: Annotated[
         float | None,
@@ -98,6 +111,8 @@ def run_command(
 
     Example: slamdepth run rgbd_dataset_freiburg1_desk --depth dinov2 --output runs/desk
 
+    Example: slamdepth run rgbd_dataset_freiburg1_rpy --depth sensor --features sift
+
     Ctrl-C finishes the run with the frames it has; a second Ctrl-C breaks it off.
     """
     settings = _settings(
@@ -106,7 +121,12 @@ def run_command(
             "odometry": odometry,
             "device": device,
             "seed": seed,
-            "depth": {"name": depth, "weights": None if depth_weights is None else str(depth_weights)},
+            "features": {
+                "name": features,
+                "weights": _text(features_weights),
+                "matcher": _text(features_matcher),
+            },
+            "depth": {"name": depth, "weights": _text(depth_weights)},
             "scale": {
                 "depth": depth_scale,
                 "camera_height_m": camera_height,
@@ -138,6 +158,10 @@ def _settings(path: Path | None, asked: dict[str, Any]) -> Config:
     if path is None:
         return Config.from_dict(overrides, origin="command line")
     return Config.from_yaml(path, overrides)
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
 
 
 def _show(bar: JobBar, progress: RunProgress) -> None:

@@ -1,22 +1,65 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keypoints with binary descriptors, spread over the image; extractors by name."""
+"""Keypoints with descriptors, spread over the image; extractors by name.
+
+An extractor is one file in ``slamdepth/frontend/extractors/`` with a class under
+``@register_extractor``; the files are imported when the first extractor is made.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import importlib
+import pkgutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from slamdepth.config import FeatureConfig
-from slamdepth.errors import ConfigError
-from slamdepth.frontend.matching import PixelGrid
-from slamdepth.types import Camera
+from slamdepth.depth.weights import sha256_of
+from slamdepth.errors import ConfigError, TrackingError, WeightsError
+from slamdepth.frontend.matching import PixelGrid, match_all
+from slamdepth.frontend.metric import ORB, DescriptorMetric
+from slamdepth.types import Camera, WeightsInfo
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    Ints = NDArray[np.int64]
+    Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ScaleLevels:
+    """The sizes features come in.
+
+    Attributes:
+        factor: a level's size over that of the one before.
+        count: how many there are.
+        growth: the place of a keypoint gets unsure with this power of its size.
+    """
+
+    factor: float
+    count: int
+    growth: float = 1.0
+
+    def of(self, size: Floats) -> Ints:
+        """Level of keypoints ``(N,)`` that are so many times as large as the finest; may be past the last."""
+        return np.maximum(np.rint(np.log(size) / np.log(self.factor)), 0).astype(np.int64)
+
+    def sigma_px(self, octave: Ints) -> Floats:
+        """Deviation of a keypoint's place where one pixel is that of the finest level."""
+        return self.factor ** (self.growth * octave.astype(np.float64))
+
+
+class ImageMatcher(Protocol):
+    """Matches two whole images by more than each descriptor alone."""
+
+    def __call__(self, a: Features, b: Features) -> tuple[Ints, Ints]:
+        """Pairs, as indices ``(P,)`` in ``a`` and ``b``, one to one."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -26,16 +69,34 @@ class Features:
     Attributes:
         raw_px: ``(N, 2)`` float64 pixels of the image as taken.
         px: ``(N, 2)`` float64 pixels after undistortion; all geometry uses these.
-        octave: ``(N,)`` int pyramid level, 0 the finest.
+        octave: ``(N,)`` int level of the extractor's :class:`ScaleLevels`, 0 the finest.
         sigma_px: ``(N,)`` float64 standard deviation of ``px``.
-        descriptors: ``(N, 32)`` uint8 binary descriptors.
+        descriptors: ``(N, D)``, of the width and type that ``metric`` is for.
+        metric: how descriptors are compared.
+        orb_words: finds ORB descriptors ``(M, 32)`` of the same image, for place
+            recognition; None where ``descriptors`` are ORB's.
+        matcher: matches whole images; None compares descriptors one by one.
+
+    Raises:
+        TrackingError: the descriptors are not those of the metric.
     """
 
-    raw_px: NDArray[np.float64]
-    px: NDArray[np.float64]
-    octave: NDArray[np.int64]
-    sigma_px: NDArray[np.float64]
-    descriptors: NDArray[np.uint8]
+    raw_px: Floats
+    px: Floats
+    octave: Ints
+    sigma_px: Floats
+    descriptors: NDArray[Any]
+    metric: DescriptorMetric = ORB
+    orb_words: Callable[[], NDArray[np.uint8]] | None = None
+    matcher: ImageMatcher | None = None
+
+    def __post_init__(self) -> None:
+        want, have = self.metric.empty(), self.descriptors
+        if have.dtype != want.dtype or have.shape != (len(self.px), want.shape[1]):
+            raise TrackingError(
+                f"features: {len(self.px)} keypoints need descriptors ({len(self.px)}, {want.shape[1]}) "
+                f"{want.dtype}, got {have.shape} {have.dtype}"
+            )
 
     def __len__(self) -> int:
         return len(self.px)
@@ -45,49 +106,128 @@ class Features:
         """``px`` sorted into cells; made once, since a keyframe is searched again and again."""
         return PixelGrid(self.px)
 
+    @property
+    def place_descriptors(self) -> NDArray[np.uint8]:
+        """ORB descriptors ``(M, 32)`` of the image: what places are recognised by."""
+        return self.descriptors if self.orb_words is None else self.orb_words()
+
+    def match(self, other: Features, among: Ints, *, ratio: float) -> tuple[Ints, Ints]:
+        """Match the keypoints ``among`` of this image with all of another, wherever they are.
+
+        Args:
+            among: ``(K,)`` indices, ascending, each once.
+            ratio: a match is so much nearer than the second; unless ``matcher`` decides.
+
+        Returns:
+            Pairs as indices into ``among`` and into ``other``, one to one.
+        """
+        if self.matcher is None:
+            a, b, _ = match_all(self.descriptors[among], other.descriptors, metric=self.metric, ratio=ratio)
+            return a, b
+        a, b = self.matcher(self, other)
+        place = np.full(len(self), -1, dtype=np.int64)
+        place[among] = np.arange(len(among))
+        chosen = np.flatnonzero(place[a] >= 0)
+        return place[a[chosen]], b[chosen]
+
 
 class FeatureExtractor(Protocol):
-    """Finds features in a grey image."""
+    """Finds features in a grey image.
+
+    Attributes:
+        levels: what ``Features.octave`` counts.
+    """
+
+    levels: ScaleLevels
 
     def extract(self, gray: NDArray[np.uint8], camera: Camera) -> Features:
         """Features of a ``(H, W)`` uint8 image taken by ``camera``."""
         ...
 
 
-_EXTRACTORS: dict[str, Callable[[FeatureConfig], FeatureExtractor]] = {}
+ExtractorFactory = Callable[[FeatureConfig], FeatureExtractor]
+
+
+class _Known(NamedTuple):
+    factory: ExtractorFactory
+    needs_weights: bool
+
+
+_EXTRACTORS: dict[str, _Known] = {}
 
 
 def register_extractor(
-    name: str,
-) -> Callable[[Callable[[FeatureConfig], FeatureExtractor]], Callable[[FeatureConfig], FeatureExtractor]]:
-    """Make an extractor available as ``features.name`` in the settings."""
+    name: str, *, needs_weights: bool = False
+) -> Callable[[ExtractorFactory], ExtractorFactory]:
+    """Make an extractor available as ``features.name`` in the settings.
 
-    def register(
-        factory: Callable[[FeatureConfig], FeatureExtractor],
-    ) -> Callable[[FeatureConfig], FeatureExtractor]:
-        _EXTRACTORS[name] = factory
+    Args:
+        needs_weights: it is a network, whose file ``features.weights`` names.
+    """
+
+    def register(factory: ExtractorFactory) -> ExtractorFactory:
+        if name in _EXTRACTORS:
+            raise ConfigError(f"two features are called '{name}'")
+        _EXTRACTORS[name] = _Known(factory, needs_weights)
         return factory
 
     return register
+
+
+def feature_names() -> list[str]:
+    """Every name :func:`create_extractor` knows, in order."""
+    from slamdepth.frontend import extractors
+
+    for module in pkgutil.iter_modules(extractors.__path__):
+        importlib.import_module(f"{extractors.__name__}.{module.name}")
+    return sorted(_EXTRACTORS)
+
+
+def needs_weights(name: str) -> bool:
+    """Whether the feature called ``name`` is a network, whose file the settings must name.
+
+    Raises:
+        ConfigError: no extractor has that name; lists those that exist.
+    """
+    return _looked_up(name).needs_weights
+
+
+def _looked_up(name: str) -> _Known:
+    names = feature_names()
+    if name not in names:
+        raise ConfigError(f"features.name: no feature is called '{name}'; known: {', '.join(names)}")
+    return _EXTRACTORS[name]
 
 
 def create_extractor(config: FeatureConfig) -> FeatureExtractor:
     """Build the extractor that ``config.name`` names.
 
     Raises:
-        ConfigError: no extractor has that name; lists those that exist.
+        ConfigError: no extractor has that name (lists those that exist), the installed
+            OpenCV lacks it, or it needs a weights file or takes none.
+        WeightsError: its weights are missing or of another layout.
     """
-    try:
-        factory = _EXTRACTORS[config.name]
-    except KeyError:
-        known = ", ".join(sorted(_EXTRACTORS))
-        raise ConfigError(f"features.name: no feature is called '{config.name}'; known: {known}") from None
-    return factory(config)
+    known = _looked_up(config.name)
+    files = [name for name in (config.weights, config.matcher) if name is not None]
+    if known.needs_weights and config.weights is None:
+        raise ConfigError(
+            f"feature '{config.name}' is a network: name its ONNX file with --features-weights FILE"
+        )
+    if files and not known.needs_weights:
+        raise ConfigError(f"feature '{config.name}' takes no weights file; leave out {files[0]}")
+    for file in files:
+        if not Path(file).expanduser().is_file():
+            raise WeightsError(f"{file}: no such file with weights of feature '{config.name}'")
+    return known.factory(config)
 
 
-def spread(
-    px: NDArray[np.float64], response: NDArray[np.float64], count: int, cell_px: float
-) -> NDArray[np.int64]:
+def feature_weights(config: FeatureConfig) -> tuple[WeightsInfo, ...]:
+    """The files of networks that ``config`` names; what they were trained on they do not say."""
+    files = [Path(name).expanduser() for name in (config.weights, config.matcher) if name is not None]
+    return tuple(WeightsInfo(file.stem, sha256_of(file), "unknown", "unknown") for file in files)
+
+
+def spread(px: Floats, response: Floats, count: int, cell_px: float) -> Ints:
     """Choose ``count`` keypoints evenly: every cell's best first, then every cell's second.
 
     Args:
@@ -113,49 +253,6 @@ def spread(
     return np.sort(chosen)
 
 
-@register_extractor("orb")
-class OrbExtractor:
-    """ORB (Rublee et al. 2011), re-spread because OpenCV's own choice clusters."""
-
-    candidates_per_keypoint = 4
-
-    def __init__(self, config: FeatureConfig) -> None:
-        import cv2
-
-        self._config = config
-        self._orb = cv2.ORB.create(
-            nfeatures=config.count * self.candidates_per_keypoint,
-            scaleFactor=config.scale_factor,
-            nlevels=config.levels,
-            fastThreshold=config.fast_threshold,
-        )
-
-    def extract(self, gray: NDArray[np.uint8], camera: Camera) -> Features:
-        config = self._config
-        keypoints = self._orb.detect(gray, None)
-        px = _pixels(keypoints)
-        response = np.array([k.response for k in keypoints], dtype=np.float64)
-        cell_px = np.sqrt(gray.shape[0] * gray.shape[1] / config.count) * 1.5
-        kept = [keypoints[i] for i in spread(px, response, config.count, cell_px)]
-        chosen, descriptors = self._orb.compute(gray, kept)
-        n = len(chosen)
-        if n == 0:
-            descriptors = np.zeros((0, 32), dtype=np.uint8)
-        raw_px = _pixels(chosen)
-        octave = np.array([k.octave for k in chosen], dtype=np.int64)
-        return Features(
-            raw_px=raw_px,
-            px=camera.undistort_points(raw_px),
-            octave=octave,
-            sigma_px=config.scale_factor ** octave.astype(np.float64),
-            descriptors=np.ascontiguousarray(descriptors),
-        )
-
-
-def _pixels(keypoints: Sequence[Any]) -> NDArray[np.float64]:
-    """Where OpenCV's keypoints are, ``(N, 2)``."""
-    import cv2
-
-    if len(keypoints) == 0:
-        return np.zeros((0, 2))
-    return np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
+def cell_edge_px(gray: NDArray[np.uint8], count: int) -> float:
+    """Edge of a cell for :func:`spread`: about two keypoints a cell."""
+    return float(np.sqrt(gray.shape[0] * gray.shape[1] / count) * 1.5)

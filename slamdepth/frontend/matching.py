@@ -1,46 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matching of binary descriptors, near a predicted place or over whole images."""
+"""Matching of descriptors, near a predicted place or over whole images."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from slamdepth.frontend.metric import FARTHEST, ORB, DescriptorMetric
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Ints = NDArray[np.int64]
     Floats = NDArray[np.float64]
-    Bytes = NDArray[np.uint8]
 
 _MAX_CELLS = 256  # along a side
-_BLOCK = 16  # rows of a table whose parts stay in a core's cache
-
-MAX_DISTANCE = 64
-"""Hamming distance beyond which two ORB descriptors are never one point."""
-
-
-def hamming(a: Bytes, b: Bytes) -> Ints:
-    """Bits that differ between descriptors ``(..., 32)`` uint8, row by row."""
-    xor = np.ascontiguousarray(a).view(np.uint64) ^ np.ascontiguousarray(b).view(np.uint64)
-    bits = np.bitwise_count(xor)
-    total = bits[..., 0].astype(np.int64)
-    for word in range(1, bits.shape[-1]):  # four additions of columns beat a sum along the short axis
-        total += bits[..., word]
-    return total
-
-
-def hamming_table(a: Bytes, b: Bytes) -> NDArray[np.uint16]:
-    """``(N, M)`` bits that differ between all descriptors ``(N, 32)`` and ``(M, 32)``."""
-    wide_a = np.ascontiguousarray(a).view(np.uint64)
-    wide_b = np.ascontiguousarray(np.ascontiguousarray(b).view(np.uint64).T)
-    table = np.zeros((len(a), len(b)), dtype=np.uint16)
-    for start in range(0, len(a), _BLOCK):
-        block = wide_a[start : start + _BLOCK]
-        for word, column in enumerate(wide_b):
-            table[start : start + _BLOCK] += np.bitwise_count(block[:, word, None] ^ column)
-    return table
 
 
 class PixelGrid:
@@ -110,7 +85,7 @@ def best_matches(
 
     Args:
         query, target: ``(P,)`` indices below 2^22 and 2^30.
-        distance: ``(P,)`` at most 1023.
+        distance: ``(P,)`` at most :data:`slamdepth.frontend.metric.FARTHEST`.
 
     Returns:
         ``(query, target, distance)`` sorted by query.
@@ -119,7 +94,7 @@ def best_matches(
         return query, target, distance
     # three numbers in one: sorting integers is several times faster than sorting by three keys
     key = np.sort((query << 40) | (distance << 30) | target)
-    q, d, t = key >> 40, (key >> 30) & 0x3FF, key & 0x3FFFFFFF
+    q, d, t = key >> 40, (key >> 30) & FARTHEST, key & 0x3FFFFFFF
     first = np.r_[True, q[1:] != q[:-1]]
     second = np.full(len(q), 1 << 30)
     second[:-1] = np.where(q[1:] == q[:-1], d[1:], 1 << 30)
@@ -135,9 +110,9 @@ def best_matches(
 
 
 def match_all(
-    a: Bytes, b: Bytes, *, max_distance: int = MAX_DISTANCE, ratio: float = 0.8
+    a: NDArray[Any], b: NDArray[Any], *, metric: DescriptorMetric = ORB, ratio: float = 0.8
 ) -> tuple[Ints, Ints, Ints]:
-    """Mutual nearest neighbours of descriptors ``(N, 32)`` and ``(M, 32)`` with a ratio test.
+    """Mutual nearest neighbours of descriptors ``(N, D)`` and ``(M, D)`` with a ratio test.
 
     Returns:
         ``(index in a, index in b, distance)``.
@@ -145,12 +120,12 @@ def match_all(
     empty = np.zeros(0, dtype=np.int64)
     if len(a) == 0 or len(b) < 2:
         return empty, empty, empty
-    table = hamming_table(a, b)
+    table = metric.table(a, b)
     best = table.argmin(axis=1)
     rows = np.arange(len(a))
     d = table[rows, best].astype(np.int64)
     backward = table.argmin(axis=0)
     table[rows, best] = np.iinfo(table.dtype).max
     second = table.min(axis=1)
-    keep = (backward[best] == rows) & (d <= max_distance) & (d <= ratio * second)
+    keep = (backward[best] == rows) & (d <= metric.max_distance) & (d <= ratio * second)
     return rows[keep], best[keep], d[keep]

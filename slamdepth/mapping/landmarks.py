@@ -70,6 +70,7 @@ class LandmarkMap:
         self.keyframes: list[MapKeyframe] = []
         self.size = 0
         self._compact_at = _LEAST_ROWS
+        self.descriptor = np.zeros((0, 0), np.uint8)
         self._move(np.zeros(0, dtype=np.int64), _LEAST_ROWS)
 
     def _move(self, kept: Ints, capacity: int) -> None:
@@ -83,7 +84,7 @@ class LandmarkMap:
 
         move("position_w", (3,), np.float64)
         move("covariance_w", (3, 3), np.float64)
-        move("descriptor", (32,), np.uint8)
+        move("descriptor", self.descriptor.shape[1:], self.descriptor.dtype)
         move("birth_keyframe", (), np.int64)
         move("octave", (), np.int64)
         move("distance_m", (), np.float64)
@@ -96,7 +97,7 @@ class LandmarkMap:
 
     position_w: Floats
     covariance_w: Floats
-    descriptor: NDArray[np.uint8]
+    descriptor: NDArray[Any]
     birth_keyframe: Ints
     octave: Ints
     distance_m: Floats
@@ -114,6 +115,9 @@ class LandmarkMap:
         n = len(feature)
         while self.size + n > len(self.alive):
             self._move(np.arange(self.size), 2 * len(self.alive))
+        if self.size == 0:  # the first points tell what a descriptor is
+            kind = keyframe.features.descriptors
+            self.descriptor = np.zeros((len(self.alive), *kind.shape[1:]), kind.dtype)
         rows = np.arange(self.size, self.size + n)
         self.size += n
         self.position_w[rows] = position_w

@@ -19,6 +19,7 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.depth.scale_file import write_scale
 from slamdepth.errors import DatasetError, OutputError, SlamdepthError
+from slamdepth.frontend.features import feature_weights
 from slamdepth.io import write_text, write_tum_trajectory
 from slamdepth.pipeline.folder import FILES, RunFolder, run_log, write_log_to
 from slamdepth.pipeline.options import (
@@ -107,7 +108,12 @@ def run(
             if scale.fit is not None:
                 write_scale(folder / "depth_scale.yaml", scale.fit)
             logger.info(
-                "%s: %d of %d frames, depth by %s", dataset.path, len(indices), len(dataset), model.name
+                "%s: %d of %d frames, depth by %s, %s features",
+                dataset.path,
+                len(indices),
+                len(dataset),
+                model.name,
+                config.features.name if config.odometry == "orb" else "no",
             )
             tracked = track(
                 dataset,
@@ -176,7 +182,7 @@ def _finish(
             fps=tracked.fps,
             config=config,
             scale=scale_facts,
-            weights=model.weights,
+            weights=(*model.weights, *feature_weights(config.features)),
             steps=tracked.steps,
             trajectory_score=trajectory_score,
             depth_score=judge_depth(dataset, reconstruction.keyframes),

@@ -43,7 +43,8 @@ def run_table(summary: dict[str, Any], places: dict[str, str] | None = None) -> 
     if mesh["vertices"] is not None:
         rows.append(("mesh", f"{count(mesh['vertices'])} vertices, {count(mesh['triangles'])} triangles"))
     rows += list((places or {}).items())
-    return two_columns(f"{summary['sequence']} · depth: {summary['depth_model']}", rows)
+    features = f" · features: {summary['features']}" if summary["features"] else ""
+    return two_columns(f"{summary['sequence']} · depth: {summary['depth_model']}{features}", rows)
 
 
 def trajectory_table(figures: dict[str, Any], title: str = "trajectory", digits: int = 6) -> Table:

@@ -39,7 +39,8 @@ def build_html(data: ReportData, summary: dict[str, Any]) -> str:
 
 def _header(summary: dict[str, Any]) -> str:
     depth = "sensor depth" if summary["depth_model"] == "sensor" else f"depth by {summary['depth_model']}"
-    lead = f"{depth} · {count(summary['frames'])} frames. {summary['scale']['sentence']}"
+    features = f", {summary['features']} features" if summary["features"] else ""
+    lead = f"{depth}{features} · {count(summary['frames'])} frames. {summary['scale']['sentence']}"
     return (
         f'<header><div class="product">slamdepth {escape(str(summary["versions"]["slamdepth"]))} · run report'
         f"</div><h1>{escape(summary['sequence'])}</h1>"

@@ -147,7 +147,7 @@ class LocalMapper:
             rows = mine[~seen_there[mine]]
             visible = self._localiser.expected(other.T_camera_world, rows)
             rows, at, _ = self._localiser.search(
-                visible, other.features, 2.5, 60.0, max_distance=50, ratio=0.75, sigmas=2.5
+                visible, other.features, 2.5, 60.0, is_strict=True, ratio=0.75, sigmas=2.5
             )
             self._attach(other, rows, at)
 

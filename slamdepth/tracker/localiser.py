@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.config import Config
-from slamdepth.frontend.features import Features
-from slamdepth.frontend.matching import best_matches, hamming, match_all
+from slamdepth.frontend.features import Features, ScaleLevels
+from slamdepth.frontend.matching import best_matches
 from slamdepth.frontend.pose import pixel_covariance, pose_from_scratch, refine_pose
 from slamdepth.geometry import project, transform
 from slamdepth.mapping.landmarks import LandmarkMap
@@ -53,12 +53,19 @@ class Visible:
 
 
 class Localiser:
-    """Places frames in a :class:`LandmarkMap`."""
+    """Places frames in a :class:`LandmarkMap`.
 
-    def __init__(self, camera: Camera, config: Config, landmarks: LandmarkMap) -> None:
+    Args:
+        levels: of the extractor whose features it is given; None takes ORB's.
+    """
+
+    def __init__(
+        self, camera: Camera, config: Config, landmarks: LandmarkMap, levels: ScaleLevels | None = None
+    ) -> None:
         self._camera = camera.without_distortion()
         self._config = config
         self._map = landmarks
+        self._levels = levels or ScaleLevels(config.features.scale_factor, config.features.levels)
 
     def expected(self, T_camera_world: Floats, rows: Ints) -> Visible:
         """Which of the points ``rows`` a camera at ``T_camera_world`` should see, and where."""
@@ -78,14 +85,14 @@ class Localiser:
         offset = points_w - center_w
         distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
         ok &= np.einsum("ni,ni->n", offset, landmarks.direction_w[rows]) > 0.5 * distance
-        step = np.log(landmarks.distance_m[rows] / distance) / np.log(self._config.features.scale_factor)
+        step = np.log(landmarks.distance_m[rows] / distance) / np.log(self._levels.factor)
         octave = np.rint(landmarks.octave[rows] + step).astype(np.int64)
-        ok &= (octave >= -1) & (octave <= self._config.features.levels)
+        ok &= (octave >= -1) & (octave <= self._levels.count)
         at = np.flatnonzero(ok)
         covariance = pixel_covariance(
             camera, T_camera_world, points_c[at], landmarks.covariance_w[rows[at]], np.zeros(len(at))
         )
-        octave = np.clip(octave[at], 0, self._config.features.levels - 1)
+        octave = np.clip(octave[at], 0, self._levels.count - 1)
         return Visible(rows[at], px[at], covariance, octave)
 
     def search(
@@ -95,7 +102,7 @@ class Localiser:
         radius_px: float,
         max_px: float,
         *,
-        max_distance: int = 64,
+        is_strict: bool = False,
         ratio: float = 0.85,
         sigmas: float = 3.0,
     ) -> tuple[Ints, Ints, Ints]:
@@ -104,11 +111,12 @@ class Localiser:
         Args:
             radius_px: error of the pose alone, in pixels of the finest level.
             max_px: no search goes farther.
+            is_strict: ask for nearer descriptors, where a wrong match would stay in the map.
 
         Returns:
-            ``(map rows, feature indices, Hamming distances)``, one to one.
+            ``(map rows, feature indices, descriptor distances)``, one to one.
         """
-        octave_scale = self._config.features.scale_factor ** visible.octave.astype(np.float64)
+        octave_scale = self._levels.sigma_px(visible.octave)
         S = visible.covariance_px
         half_trace = 0.5 * (S[:, 0, 0] + S[:, 1, 1])
         largest = half_trace + np.sqrt(
@@ -126,8 +134,10 @@ class Localiser:
         square = (c * d[:, 0] ** 2 - 2 * b * d[:, 0] * d[:, 1] + a * d[:, 1] ** 2) / (a * c - b * b)
         ok = square < MAHALANOBIS_GATE
         q, t = q[ok], t[ok]
-        distance = hamming(self._map.descriptor[visible.rows[q]], features.descriptors[t])
-        q, t, distance = best_matches(q, t, distance, max_distance=max_distance, ratio=ratio)
+        metric = features.metric
+        distance = metric.between(self._map.descriptor[visible.rows[q]], features.descriptors[t])
+        limit = metric.strict_distance if is_strict else metric.max_distance
+        q, t, distance = best_matches(q, t, distance, max_distance=limit, ratio=ratio)
         return visible.rows[q], t, distance
 
     def track(
@@ -229,7 +239,7 @@ class Localiser:
         has = np.flatnonzero(keyframe.point_ids >= 0)
         if len(has) < need:
             return None
-        a, b, _ = match_all(keyframe.features.descriptors[has], features.descriptors, ratio=0.85)
+        a, b = keyframe.features.match(features, has, ratio=0.85)
         rows = keyframe.point_ids[has[a]]
         solution = pose_from_scratch(
             self._camera,

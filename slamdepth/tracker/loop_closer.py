@@ -56,7 +56,7 @@ class LoopCloser:
 
     def add(self, keyframe: MapKeyframe) -> None:
         """Let the keyframe be found by later ones."""
-        self.places.add(keyframe.id, keyframe.features.descriptors)
+        self.places.add(keyframe.id, keyframe.features.place_descriptors)
 
     def close(self, keyframe: MapKeyframe) -> Correction | None:
         """Look for a loop at ``keyframe``; on success the map has been corrected."""

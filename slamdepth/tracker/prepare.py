@@ -25,14 +25,18 @@ class Prepared:
 class Preparation:
     """Finds features; any thread may call it.
 
+    Attributes:
+        levels: sizes the features come in.
+
     Raises:
-        ConfigError: no feature has the configured name.
+        ConfigError, WeightsError: as ``create_extractor``.
     """
 
     def __init__(self, camera: Camera, config: FeatureConfig) -> None:
         self._camera = camera
         self._extractor = create_extractor(config)
         self._in_use = threading.Lock()
+        self.levels = self._extractor.levels
 
     def __call__(self, frame: Frame) -> Prepared:
         import cv2

@@ -81,7 +81,7 @@ class Tracker:
         self._preparation = Preparation(camera, self.config.features)
         self._watch = Stopwatch()
         self._map = LandmarkMap()
-        self._localiser = Localiser(camera, self.config, self._map)
+        self._localiser = Localiser(camera, self.config, self._map, self._preparation.levels)
         self._shutter = Shutter(camera, self.config.shutter, self._map)
         self._adjuster = MapAdjuster(camera, self.config, self._map, self._shutter)
         self._mapper = LocalMapper(camera, self.config, self._map, self._localiser, self._adjuster)
@@ -295,7 +295,7 @@ class Tracker:
         return motion @ last.T_camera_world
 
     def _relocalise(self, features: Features) -> Placement | None:
-        answers = self._loops.places.query(features.descriptors, top_k=_RELOCALISATION_CANDIDATES)
+        answers = self._loops.places.query(features.place_descriptors, top_k=_RELOCALISATION_CANDIDATES)
         newest = len(self._map.keyframes) - 1
         tried = newest if self._last is not None else -1
         for k in dict.fromkeys([newest, *(k for k, _ in answers)]):

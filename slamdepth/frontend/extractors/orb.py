@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ORB: the default feature, and the words that places are recognised by."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.config import FeatureConfig
+from slamdepth.frontend.features import Features, ScaleLevels, cell_edge_px, register_extractor, spread
+from slamdepth.frontend.metric import ORB
+from slamdepth.frontend.opencv_features import pixels, responses
+from slamdepth.types import Camera
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@register_extractor("orb")
+class OrbExtractor:
+    """ORB (Rublee et al. 2011), re-spread because OpenCV's own choice clusters."""
+
+    candidates_per_keypoint = 4
+
+    def __init__(self, config: FeatureConfig) -> None:
+        import cv2
+
+        self._count = config.count
+        self.levels = ScaleLevels(config.scale_factor, config.levels)
+        self._orb = cv2.ORB.create(
+            nfeatures=config.count * self.candidates_per_keypoint,
+            scaleFactor=config.scale_factor,
+            nlevels=config.levels,
+            fastThreshold=config.fast_threshold,
+        )
+
+    def extract(self, gray: NDArray[np.uint8], camera: Camera) -> Features:
+        keypoints = self._orb.detect(gray, None)
+        kept = spread(pixels(keypoints), responses(keypoints), self._count, cell_edge_px(gray, self._count))
+        # ORB describes fast and detects many, so only those kept are described
+        chosen, descriptors = self._orb.compute(gray, [keypoints[i] for i in kept])
+        raw_px = pixels(chosen)
+        octave = np.array([k.octave for k in chosen], dtype=np.int64)
+        return Features(
+            raw_px=raw_px,
+            px=camera.undistort_points(raw_px),
+            octave=octave,
+            sigma_px=self.levels.sigma_px(octave),
+            descriptors=np.ascontiguousarray(descriptors) if len(chosen) else ORB.empty(),
+        )

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far two descriptors are from one another, and how near they must be to show one point.
+
+A distance is an integer from 0 to :data:`FARTHEST`, whatever the descriptor: so matching
+sorts pairs by one packed number and knows nothing of bits and floats.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Ints = NDArray[np.int64]
+    Bytes = NDArray[np.uint8]
+    Floats = NDArray[np.float32]
+    Descriptors = NDArray[Any]
+
+FARTHEST = 1023
+"""No distance is larger; what is farther is given as this."""
+
+_BLOCK = 16  # rows of a table whose parts stay in a core's cache
+_UNIT = FARTHEST / 2.0  # two unit vectors are at most 2 apart
+
+
+class DescriptorMetric(Protocol):
+    """What matching knows of descriptors.
+
+    Attributes:
+        max_distance: two descriptors farther apart are never one point.
+        strict_distance: the same where a wrong match would stay in the map.
+    """
+
+    @property
+    def max_distance(self) -> int: ...
+
+    @property
+    def strict_distance(self) -> int: ...
+
+    def empty(self) -> Descriptors:
+        """No descriptors, ``(0, D)``, of the right width and type."""
+        ...
+
+    def between(self, a: Descriptors, b: Descriptors) -> Ints:
+        """Distances ``(N,)`` of descriptors ``(N, D)`` row by row."""
+        ...
+
+    def table(self, a: Descriptors, b: Descriptors) -> NDArray[np.uint16]:
+        """Distances ``(N, M)`` of all descriptors ``(N, D)`` from all ``(M, D)``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Hamming:
+    """Bits that differ between binary descriptors ``(N, size)`` uint8.
+
+    Attributes:
+        size: bytes of a descriptor; a multiple of 8 is fastest, see :func:`whole_words`.
+    """
+
+    size: int = 32
+    max_distance: int = 64
+    strict_distance: int = 50
+
+    def empty(self) -> Bytes:
+        return np.zeros((0, self.size), dtype=np.uint8)
+
+    def between(self, a: Bytes, b: Bytes) -> Ints:
+        distance = hamming(a, b)
+        return distance if 8 * self.size <= FARTHEST else np.minimum(distance, FARTHEST)
+
+    def table(self, a: Bytes, b: Bytes) -> NDArray[np.uint16]:
+        table = hamming_table(a, b)
+        return table if 8 * self.size <= FARTHEST else np.minimum(table, np.uint16(FARTHEST))
+
+
+@dataclass(frozen=True)
+class UnitL2:
+    """Euclidean distance of unit vectors ``(N, size)`` float32, in steps of 2 / 1023.
+
+    Attributes:
+        size: numbers of a descriptor.
+        max_l2, strict_l2: the thresholds as they are in the literature, 0 to 2.
+    """
+
+    size: int
+    max_l2: float
+    strict_l2: float
+
+    @property
+    def max_distance(self) -> int:
+        return int(self.max_l2 * _UNIT)
+
+    @property
+    def strict_distance(self) -> int:
+        return int(self.strict_l2 * _UNIT)
+
+    def empty(self) -> Floats:
+        return np.zeros((0, self.size), dtype=np.float32)
+
+    def between(self, a: Floats, b: Floats) -> Ints:
+        return _steps(np.einsum("ij,ij->i", a, b)).astype(np.int64)
+
+    def table(self, a: Floats, b: Floats) -> NDArray[np.uint16]:
+        return _steps(a @ b.T).astype(np.uint16)
+
+
+def _steps(cosine: Floats) -> Floats:
+    """The distance of unit vectors by their inner product, whole steps of 2 / 1023."""
+    return np.rint(np.sqrt(np.clip(2.0 - 2.0 * cosine, 0.0, 4.0)) * np.float32(_UNIT))
+
+
+ORB = Hamming(32, 64, 50)
+"""Of ORB's 256 bits."""
+
+
+def whole_words(descriptors: Bytes) -> Bytes:
+    """Binary descriptors ``(..., D)`` filled up with zeros to a multiple of 8 bytes."""
+    rest = -descriptors.shape[-1] % 8
+    if rest == 0:
+        return np.ascontiguousarray(descriptors)
+    filling = [(0, 0)] * (descriptors.ndim - 1) + [(0, rest)]
+    return np.pad(descriptors, filling)
+
+
+def hamming(a: Bytes, b: Bytes) -> Ints:
+    """Bits that differ between descriptors ``(..., D)`` uint8 of any length, row by row."""
+    xor = whole_words(a).view(np.uint64) ^ whole_words(b).view(np.uint64)
+    bits = np.bitwise_count(xor)
+    total = bits[..., 0].astype(np.int64)
+    for word in range(1, bits.shape[-1]):  # additions of columns beat a sum along the short axis
+        total += bits[..., word]
+    return total
+
+
+def hamming_table(a: Bytes, b: Bytes) -> NDArray[np.uint16]:
+    """``(N, M)`` bits that differ between all descriptors ``(N, D)`` and ``(M, D)``."""
+    wide_a = whole_words(a).view(np.uint64)
+    wide_b = np.ascontiguousarray(whole_words(b).view(np.uint64).T)
+    table = np.zeros((len(a), len(b)), dtype=np.uint16)
+    for start in range(0, len(a), _BLOCK):
+        block = wide_a[start : start + _BLOCK]
+        for word, column in enumerate(wide_b):
+            table[start : start + _BLOCK] += np.bitwise_count(block[:, word, None] ^ column)
+    return table
