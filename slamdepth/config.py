@@ -29,7 +29,10 @@ class FeatureConfig(_Section):
     count: int = Field(1000, ge=100, le=10000, description="keypoints kept per frame")
     levels: int = Field(8, ge=1, le=12, description="pyramid levels of ORB")
     scale_factor: float = Field(1.2, gt=1.0, le=2.0, description="ratio of one level of ORB to the next")
-    fast_threshold: int = Field(7, ge=1, le=100, description="lowest FAST contrast, grey values")
+    fast_threshold: int = Field(20, ge=1, le=100, description="contrast of ORB's corners, grey values")
+    fast_threshold_low: int = Field(
+        7, ge=1, le=100, description="the same in images that have too few such corners"
+    )
     weights: str | None = Field(None, min_length=1, description="ONNX file of a feature that is a network")
     matcher: str | None = Field(
         None, min_length=1, description="LightGlue's ONNX file for it, to match whole images with"
@@ -41,7 +44,7 @@ class TrackingConfig(_Section):
 
     min_inliers: int = Field(20, ge=6, description="fewer agreeing points and the frame is lost")
     keyframe_overlap: float = Field(
-        0.6, gt=0, lt=1, description="a keyframe is made when less of the last one is still seen"
+        0.55, gt=0, lt=1, description="a keyframe is made when less of the last one is still seen"
     )
     keyframe_overlap_start: float = Field(
         0.85, gt=0, lt=1, description="the same for the first keyframes, which triangulate the first points"
