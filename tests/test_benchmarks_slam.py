@@ -33,7 +33,8 @@ def output(tiny_room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("benchmark")
     done = slam(
         "--data", tiny_room.parent, "--sequences", tiny_room.name, "--depth", "sensor", "--pace", "fast",
-        "--systems", "slamdepth,slamdepth-icp,open3d,kiss-icp", "--max-frames", 12, "--runs", 2,
+        "--systems", "slamdepth,slamdepth-icp,open3d,kiss-icp", "--features", "orb,sift",
+        "--max-frames", 12, "--runs", 2,
         "--cache", folder / "cache", "--output", folder / "slam.json",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -50,7 +51,8 @@ def benchmark(output: Path) -> dict[str, Any]:
 
 def test_every_system_is_measured_in_its_own_process(benchmark: dict[str, Any]) -> None:
     rows = {row["label"]: row for row in benchmark["rows"]}
-    assert list(rows) == ["slamdepth", "slamdepth, KISS-ICP", "Open3D RGB-D odometry", "KISS-ICP"]
+    ours = ["slamdepth", "slamdepth, sift", "slamdepth, KISS-ICP"]
+    assert list(rows) == [*ours, "Open3D RGB-D odometry", "KISS-ICP"]
     for row in rows.values():
         assert row["status"] == "ok", row["message"]
         assert [run["frames"] for run in row["runs"]] == [12, 12]
@@ -66,6 +68,7 @@ def test_every_system_is_measured_in_its_own_process(benchmark: dict[str, Any]) 
 def test_exact_depth_of_a_room_gives_good_trajectories(benchmark: dict[str, Any]) -> None:
     ate = {row["label"]: row["figures"]["ate_se3_m"]["median"] for row in benchmark["rows"]}
     assert ate["slamdepth"] < 0.02
+    assert ate["slamdepth, sift"] < 0.02
     assert all(value < 0.15 for value in ate.values()), ate
 
 

@@ -136,7 +136,7 @@ BAD_CALLS = {
     "features without a file": ((*RUN, "--features", "aliked"), "with --features-weights FILE"),
     "features with a wrong file": (
         (*RUN, "--features", "aliked", "--features-weights", "FILE"),
-        "not a readable ONNX file",
+        "takes nothing, not 'image' (1, 3, rows, columns) as ALIKED does",
     ),
     "features not used": (
         (*RUN, "--odometry", "kiss-icp", "--features", "sift"),
