@@ -55,7 +55,7 @@ def test_two_seconds_of_black_frames(predicted: bool) -> None:
     assert errors_m(run.results)[28:].max() < 0.05
     made = run.finish()
     assert (made.tracked, made.relocalisations) == (COUNT - 4, 1)
-    assert len(made.keyframes) > keyframes
+    assert len(made.keyframes) >= keyframes  # the old map is still there
 
 
 def test_from_the_middle_to_the_end_and_then_from_the_start() -> None:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-_START_KEYFRAMES = 5  # until so many, most points are known by a predicted depth only
+_START_KEYFRAMES = 8  # until so many, most points are known by a predicted depth only
 _KNOWN_GROUND = 0.5  # of the points of a keyframe that three see, seen again
 _RESCUE_STEP_M, _RESCUE_TURN_RAD = 0.1, 0.15  # between keyframes without features
 
