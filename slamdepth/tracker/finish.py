@@ -75,12 +75,15 @@ def _adjust_all(
         before_s = shutter.readout_s
         if shutter.is_sought:
             adjuster.find_readout(every)
-        if n > 0 and abs(shutter.readout_s - before_s) < _SETTLED_S:
+        is_settled = abs(shutter.readout_s - before_s) < _SETTLED_S
+        if n > 0 and is_settled:
             break
         _follow_motion(landmarks, frames, shutter)
         for keyframe in landmarks.keyframes:
             mapper.search_neighbours(keyframe, limit=_SEARCHED_AGAIN)
         adjuster.adjust(every, [], landmarks.seen_by(2), (5, 8))
+        if is_settled:
+            break
 
 
 def _follow_motion(landmarks: LandmarkMap, frames: FrameLog, shutter: Shutter) -> None:
