@@ -54,7 +54,8 @@ def config_without(
     """``base`` without one place, or as it is.
 
     Each place becomes a source of its own, so that its features are shared by all trainings; a
-    source's ``limit`` is spread over its places.
+    source's ``limit`` is spread over its places. With fewer members than ``base`` has, the first ones
+    are trained, and what only the others learn from is left out.
 
     Args:
         samples: no more than so many views of a place.
@@ -65,8 +66,12 @@ def config_without(
     """
     if left_out is not None and left_out not in places_of(base):
         raise ConfigError(f"'{left_out}' cannot be left out; there are: {', '.join(places_of(base))}")
+    count = (overruled or {}).get("members", base.members)
     sources = []
     for source in base.sources:
+        members = None if source.members is None else [m for m in source.members if m < count]
+        if members == []:
+            continue
         total = sum(place.samples for place in source.places)
         share = min(1.0, source.limit / total) if source.limit else 1.0
         for place in source.places:
@@ -75,7 +80,9 @@ def config_without(
             views = max(1, round(place.samples * share))
             views = views if samples is None else min(views, samples)
             one = {**place.model_dump(), "samples": views}
-            sources.append({**source.model_dump(), "places": [one], "held_out": [], "limit": None})
+            sources.append(
+                {**source.model_dump(), "places": [one], "members": members, "held_out": [], "limit": None}
+            )
     values = {**base.model_dump(), **(overruled or {}), "sources": sources, "output": str(output)}
     return TrainConfig.from_dict({**values, "trained_on": ""}, origin="benchmarks.depth_places")
 

@@ -9,7 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from slamdepth.errors import ConfigError
 
@@ -151,6 +159,19 @@ class TrainConfig(_Section):
             if name not in SEARCHABLE:
                 raise ValueError(f"'{name}' cannot be searched; choose from: {', '.join(SEARCHABLE)}")
         return search
+
+    @field_validator("sources")
+    @classmethod
+    def _have_their_members(
+        cls, sources: tuple[SourceConfig, ...], info: ValidationInfo
+    ) -> tuple[SourceConfig, ...]:
+        count = info.data.get("members")
+        for source in sources:
+            for member in source.members or ():
+                if count is not None and not 0 <= member < count:
+                    there_are = f"there are members 0 to {count - 1}"
+                    raise ValueError(f"'{source.folder}' is to teach member {member}, and {there_are}")
+        return sources
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> TrainConfig:

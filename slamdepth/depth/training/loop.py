@@ -20,11 +20,18 @@ import numpy as np
 import torch
 from torch import nn
 
-from slamdepth.depth import weights as store
 from slamdepth.depth.checkpoints import check_device
-from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
+from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.head import UPSAMPLING, DepthHead, HeadEnsemble, HeadShape, save_head
-from slamdepth.depth.training.caches import PlannedCache, benchmarks_seen, fill_cache, of_member, plan_caches
+from slamdepth.depth.training.caches import (
+    Encoder,
+    PlannedCache,
+    benchmarks_seen,
+    fill_cache,
+    of_member,
+    open_encoder,
+    plan_caches,
+)
 from slamdepth.depth.training.checkpoint import (
     checkpoint_path,
     load_checkpoint,
@@ -77,23 +84,20 @@ def train_depth(
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{output.parent}: cannot be made: {error.strerror}") from error
-    backbone_sha256 = "given"
-    if backbone is None:
-        file = store.find_backbone(config.backbone)
-        backbone_sha256 = store.verify(file)
-        backbone = load_dinov2(file, device).to(working_type(device))
-
-    planned = plan_caches(config, backbone_sha256, readers)
+    encoder = Encoder(backbone) if backbone is not None else open_encoder(config.backbone, device)
+    planned = plan_caches(config, encoder.key, readers)
     seen = [f"{benchmark} ({', '.join(names)})" for benchmark, names in benchmarks_seen(planned).items()]
     for benchmark in seen:
         logger.warning("trained on %s: figures of this head on it are not zero-shot", benchmark)
     caches = [
-        fill_cache(plan, config, backbone, device=device, progress=progress, stage=_stage(plan, k, planned))
+        fill_cache(
+            plan, config, encoder.backbone, device=device, progress=progress, stage=_stage(plan, k, planned)
+        )
         for k, plan in enumerate(planned)
     ]
     judging = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None]
     shape = HeadShape(
-        config.head.taps, backbone.dim, config.head.dim, config.head.blocks, config.head.guide_dim,
+        config.head.taps, encoder.backbone.dim, config.head.dim, config.head.blocks, config.head.guide_dim,
         config.members,
     )  # fmt: skip
     key = digest(config, [plan.folder.name for plan in planned])
@@ -121,7 +125,7 @@ def train_depth(
         "licence": config.licence,
         "seed": str(config.seed),
         "settings": json.dumps(config.model_dump(mode="json"), sort_keys=True),
-        "backbone_sha256": backbone_sha256,
+        "backbone_sha256": encoder.sha256,
     }
     result = TrainResult(
         output, tuple(history), held_out, ensemble.sigma_scale,

@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from slamdepth.depth import weights as store
 from slamdepth.depth.checkpoints import check_device
-from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
+from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.head import DepthHead, HeadShape
 from slamdepth.depth.preprocess import PATCH
-from slamdepth.depth.training.caches import benchmarks_seen, of_member, plan_caches
+from slamdepth.depth.training.caches import Encoder, benchmarks_seen, of_member, open_encoder, plan_caches
 from slamdepth.depth.training.config import TrainConfig
 from slamdepth.depth.training.data import PlaceReader
 from slamdepth.depth.training.features import encode, sample_specs
@@ -82,15 +81,13 @@ def plan_training(
         ConfigError, DatasetError: as :func:`~slamdepth.depth.training.caches.plan_caches`.
     """
     check_device(device)
-    backbone_sha256, missing = "given", None
-    if backbone is None:
-        try:
-            file = store.find_backbone(config.backbone)
-            backbone_sha256 = store.verify(file)
-            backbone = load_dinov2(file, device).to(working_type(device))
-        except WeightsError as error:
-            missing = str(error)
-    planned = plan_caches(config, backbone_sha256, readers)
+    encoder, missing = None, None
+    try:
+        encoder = Encoder(backbone) if backbone is not None else open_encoder(config.backbone, device)
+    except WeightsError as error:
+        missing = str(error)
+    backbone = encoder.backbone if encoder else None
+    planned = plan_caches(config, encoder.key if encoder else "missing", readers)
     dim, patch = (backbone.dim, backbone.patch) if backbone else (HeadShape().token_dim, PATCH)
     specs = sample_specs(config.view, config.head.taps, dim, patch)
     sources = tuple(
