@@ -44,6 +44,7 @@ from slamdepth.depth.training.data import PlaceReader
 from slamdepth.depth.training.features import FeatureCache, load_batch
 from slamdepth.depth.training.judge import held_out_figures, judge, sample_views
 from slamdepth.depth.training.losses import total_loss
+from slamdepth.depth.training.out_of_fold import COMPONENTS, learn_doubt, plan_folds
 from slamdepth.depth.training.progress import Progress, TrainStep, silent
 from slamdepth.depth.training.results import EpochFigures, TrainResult
 from slamdepth.depth.training.stages import FINE_COST, predict
@@ -96,9 +97,11 @@ def train_depth(
         for k, plan in enumerate(planned)
     ]
     judging = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None]
+    folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
+    dim = encoder.backbone.dim
     shape = HeadShape(
-        config.head.taps, encoder.backbone.dim, config.head.dim, config.head.blocks, config.head.guide_dim,
-        config.members,
+        config.head.taps, dim, config.head.dim, config.head.blocks, config.head.guide_dim, config.members,
+        min(COMPONENTS, dim) if folds else 0,
     )  # fmt: skip
     key = digest(config, [plan.folder.name for plan in planned])
     ensemble = HeadEnsemble(shape)
@@ -108,6 +111,19 @@ def train_depth(
         head, epochs = _train_member(config, training, judging, shape, member, key, device, progress)
         ensemble.members[member].load_state_dict(head.state_dict())
         history += epochs
+    unseen: dict[str, float] = {}
+    ensemble.sigma_scale = config.sigma_scale
+    if folds:
+
+        def of_fold(number: int, training: list[FeatureCache]) -> DepthHead:
+            alone, place = config.model_copy(update={"fine_epochs": 0}), config.members + number
+            return _train_member(alone, training, [], shape, place, key, device, progress)[0]
+
+        doubt, ensemble.sigma_scale, unseen = learn_doubt(
+            planned, caches, folds, of_fold, seed=config.seed, device=device, progress=progress
+        )
+        assert ensemble.doubt is not None
+        ensemble.doubt.load_state_dict(doubt.state_dict())
     ensemble.eval().to(device)
 
     held_out, ratios = {}, []
@@ -115,8 +131,7 @@ def train_depth(
         if plan.held_out is not None:
             held_out[plan.held_out], ratio = judge(ensemble, cache, device)
             ratios.append(ratio)
-    ensemble.sigma_scale = config.sigma_scale
-    if ratios:
+    if ratios and not folds:
         # Each place counts the same: the mean over places of the ratio that covers 68 %.
         ensemble.sigma_scale = float(np.mean([np.quantile(ratio, _ONE_SIGMA) for ratio in ratios]))
     names = ", ".join(place.name for source in config.sources for place in source.places)
@@ -129,14 +144,14 @@ def train_depth(
     }
     result = TrainResult(
         output, tuple(history), held_out, ensemble.sigma_scale,
-        sample_views(ensemble, planned, caches, _SAMPLES, device), _places(planned), about,
+        sample_views(ensemble, planned, caches, _SAMPLES, device), _places(planned), about, unseen,
     )  # fmt: skip
     try:
         save_head(output, ensemble, about)
         sync_file(output)
         if on_result is not None:
             on_result(result)
-        remove_checkpoints(config)
+        remove_checkpoints(config, config.members + len(folds))
     except OSError as error:
         raise OutputError(f"{output}: cannot be written: {error.strerror}") from error
     return result
@@ -260,7 +275,9 @@ def _how_far(config: TrainConfig, member: int, epoch: int, step: int, steps: int
     total = steps * (config.coarse_epochs + FINE_COST * config.fine_epochs)
     epochs = config.coarse_epochs + config.fine_epochs
     detail = f"epoch {epoch + 1} of {epochs}, loss {loss:.4f}"
-    return TrainStep(f"member {member + 1} of {config.members}", done, total, detail)
+    left_out = member - config.members  # beyond the members are the heads without a source each
+    what = f"without source {left_out + 1}" if left_out >= 0 else f"member {member + 1} of {config.members}"
+    return TrainStep(what, done, total, detail)
 
 
 def learning_rate(config: TrainConfig, epoch: float) -> float:

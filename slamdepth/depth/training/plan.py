@@ -21,6 +21,7 @@ from slamdepth.depth.training.data import PlaceReader
 from slamdepth.depth.training.features import encode, sample_specs
 from slamdepth.depth.training.loop import steps_per_epoch
 from slamdepth.depth.training.losses import total_loss
+from slamdepth.depth.training.out_of_fold import plan_folds
 from slamdepth.depth.training.stages import predict
 from slamdepth.depth.training.store import bytes_per_sample, done_on_disk
 from slamdepth.errors import WeightsError
@@ -106,15 +107,19 @@ def plan_training(
         steps_per_epoch(config, sum(len(plan.keys) for plan in of_member(planned, planned, member)))
         for member in range(config.members)
     )
+    folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
+    fold_steps = config.coarse_epochs * sum(
+        steps_per_epoch(config, sum(len(planned[k].keys) for k in fold.learnt)) for fold in folds
+    )
     features_s = training_s = None
     if backbone is not None:
         todo = sum(source.samples - source.cached for source in sources)
         features_s = todo * _view_s(config, backbone, device) if todo else 0.0
         coarse_s, fine_s = _step_s(config, dim, patch, device)
         epoch_s = config.coarse_epochs * coarse_s + config.fine_epochs * fine_s
-        training_s = steps * epoch_s
-    epochs = config.coarse_epochs + config.fine_epochs
-    return TrainingPlan(sources, epochs * steps, features_s, training_s, missing, benchmarks_seen(planned))
+        training_s = steps * epoch_s + fold_steps * coarse_s
+    total = steps * (config.coarse_epochs + config.fine_epochs) + fold_steps
+    return TrainingPlan(sources, total, features_s, training_s, missing, benchmarks_seen(planned))
 
 
 def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:

@@ -105,7 +105,8 @@ def search_settings(
             tried = {key: _suggest(trial, key, where) for key, where in config.search.items()}
             settings = with_settings(config, tried).model_copy(
                 update={
-                    "output": str(folder / f"trial_{number:04d}.safetensors"), "search": {}, "members": 1
+                    "output": str(folder / f"trial_{number:04d}.safetensors"),
+                    "search": {}, "members": 1, "uncertainty": "own",
                 }
             )  # fmt: skip
 
