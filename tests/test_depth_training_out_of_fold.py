@@ -55,14 +55,16 @@ def made_up_errors(seed: int = 0, places: int = 3) -> Errors:
     error = size * torch.distributions.Laplace(0.0, 1.0).sample((count,)).abs()
     view = torch.arange(count) // 100
     means = torch.stack([error[view == k].mean() for k in range(count // 100)])[view]
-    return Errors(tokens.half(), torch.randn(count, RELIEF), error, error / means, view % places, view)
+    own = torch.randn(count)
+    return Errors(tokens.half(), torch.randn(count, RELIEF), error, error / means, own, view % places, view)
 
 
 def test_it_learns_where_errors_are_large_and_how_large() -> None:
     doubt = fit_doubt(made_up_errors(), seed=0)
     other = made_up_errors(seed=1)
-    assert surest_half(doubt, other) < 0.4  # of 1 and 6 in equal parts: 1 / 3.5 = 0.29
     features = out_of_fold.features_of(doubt, other)
+    assert surest_half(doubt.judge(features), other) < 0.4  # of 1 and 6 in equal parts: 1 / 3.5 = 0.29
+    assert surest_half(other.own, other) == pytest.approx(1, abs=0.1)
     spread, is_large = doubt.judge(features).exp(), other.tokens[:, 0] > 0
     assert spread[is_large].median() / spread[~is_large].median() == pytest.approx(6, rel=0.25)
     assert spread[~is_large].median() == pytest.approx(0.1, rel=0.2)
@@ -109,6 +111,7 @@ def test_a_head_with_a_doubt_is_made_judged_and_planned(settings: dict[str, Any]
     assert isinstance(head.doubt, Doubt)
     assert head.sigma_scale == result.sigma_scale > 0
     assert set(result.unseen_surest_half) == {"hall", "loft"}
+    assert set(result.unseen_surest_half["loft"]) == {"out_of_fold", "own", "relief"}
     own = loop.train_depth(config.model_copy(update={"uncertainty": "own"}), backbone=tiny_backbone())
     without, _ = load_head(own.output)
     depth, sigma = (a - b for a, b in zip(outputs(head), outputs(without), strict=True))

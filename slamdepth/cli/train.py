@@ -61,8 +61,9 @@ def train_depth_command(
         result = run_training(settings, device=device, progress=progress)
     out.print(f"head: {result.output}", markup=False, soft_wrap=True)
     out.print(f"curves and samples: {report_folder(result.output)}", markup=False, soft_wrap=True)
-    for place, ratio in result.unseen_surest_half.items():
-        out.print(f"uncertainty learnt without {place}: surest half {ratio:.2f}", markup=False)
+    for place, ratios in result.unseen_surest_half.items():
+        shown = ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items())
+        out.print(f"surest half in {place}, left out: {shown}", markup=False)
     for place, figures in result.held_out.items():
         shown = ", ".join(f"{name} {value:.3f}" for name, value in figures.items())
         out.print(f"held out {place}: {shown}", markup=False)

@@ -111,7 +111,7 @@ def train_depth(
         head, epochs = _train_member(config, training, judging, shape, member, key, device, progress)
         ensemble.members[member].load_state_dict(head.state_dict())
         history += epochs
-    unseen: dict[str, float] = {}
+    unseen: dict[str, dict[str, float]] = {}
     ensemble.sigma_scale = config.sigma_scale
     if folds:
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -74,6 +74,7 @@ class Errors:
         relief: ``(N, RELIEF)``.
         error: ``(N,)`` size of the log error, after the view's median.
         share: ``(N,)`` the same over the view's mean.
+        own: ``(N,)`` log spread that the predicting head tells itself.
         place: ``(N,)`` counted over all sources.
         view: ``(N,)``.
     """
@@ -82,8 +83,12 @@ class Errors:
     relief: Tensor
     error: Tensor
     share: Tensor
+    own: Tensor
     place: Tensor
     view: Tensor
+
+
+_FIELDS = tuple(Errors.__dataclass_fields__)
 
 
 def errors_of(head: DepthHead, cache: FeatureCache, seed: Sequence[int], device: str) -> Errors:
@@ -98,7 +103,7 @@ def errors_of(head: DepthHead, cache: FeatureCache, seed: Sequence[int], device:
         chosen = np.arange(start, min(start + _VIEWS_AT_ONCE, len(cache)))
         tokens, class_tokens, image, depth = load_batch(cache, chosen, device)
         with torch.inference_mode():
-            log_depth = head.coarse(tokens, class_tokens, image)[0][:, 0].cpu()
+            log_depth, own = head.coarse(tokens, class_tokens, image)[0].cpu().unbind(dim=1)
         target, last, shapes = coarse_target(depth).cpu(), tokens[:, -1].cpu(), relief(log_depth)
         for k, view in enumerate(chosen):
             known = torch.nonzero(target[k] > 0)
@@ -110,7 +115,7 @@ def errors_of(head: DepthHead, cache: FeatureCache, seed: Sequence[int], device:
             row, column = known[some].unbind(dim=1)
             parts.append((
                 last[k][:, row // 2, column // 2].T.half(), shapes[k][row, column], error[some],
-                error[some] / error.mean().clamp_min(1e-6),
+                error[some] / error.mean().clamp_min(1e-6), own[k][row, column],
                 torch.full((len(some),), int(cache.place[view])), torch.full((len(some),), int(view)),
             ))  # fmt: skip
     if not parts:
@@ -123,11 +128,9 @@ def join(parts: Sequence[Errors]) -> Errors:
     place = view = 0
     moved = []
     for part in parts:
-        moved.append((
-            part.tokens, part.relief, part.error, part.share, part.place + place, part.view + view
-        ))  # fmt: skip
+        moved.append(replace(part, place=part.place + place, view=part.view + view))
         place, view = place + int(part.place.max()) + 1, view + int(part.view.max()) + 1
-    return Errors(*(torch.cat(part) for part in zip(*moved, strict=True)))
+    return Errors(*(torch.cat([getattr(part, name) for part in moved]) for name in _FIELDS))
 
 
 def fit_doubt(errors: Errors, seed: int, told: Callable[[int], None] = lambda _: None) -> Doubt:
@@ -177,20 +180,23 @@ def sigma_scale(doubt: Doubt, errors: Errors) -> float:
     return float(np.mean([np.quantile(of_place.numpy(), _ONE_SIGMA) for of_place in places]))
 
 
-def surest_half(doubt: Doubt, errors: Errors) -> float:
-    """Mean over the views of the error of the surest half of their pixels over that of all."""
-    spread = doubt.judge(features_of(doubt, errors))
+def surest_half(doubted_by: Tensor, errors: Errors) -> float:
+    """Mean over the views of the error of the surest half of their pixels over that of all.
+
+    Args:
+        doubted_by: ``(N,)``, the larger the less sure.
+    """
     found = []
     for view in errors.view.unique():
         mine = errors.view == view
-        error, doubted = torch.expm1(errors.error[mine]), spread[mine]
+        error, doubted = torch.expm1(errors.error[mine]), doubted_by[mine]
         found.append(float(error[doubted <= doubted.median()].mean() / error.mean().clamp_min(1e-9)))
     return float(np.mean(found))
 
 
 def of_places(errors: Errors, chosen: Tensor) -> Errors:
     """The pixels where ``chosen (N,)`` is true."""
-    return Errors(*(getattr(errors, name)[chosen] for name in Errors.__dataclass_fields__))
+    return Errors(*(getattr(errors, name)[chosen] for name in _FIELDS))
 
 
 def learn_doubt(
@@ -202,15 +208,16 @@ def learn_doubt(
     seed: int,
     device: str,
     progress: Progress,
-) -> tuple[Doubt, float, dict[str, float]]:
+) -> tuple[Doubt, float, dict[str, dict[str, float]]]:
     """The whole way: heads without a source each, their errors on it, the doubt learnt from all.
 
     Args:
         train: makes the head of a fold, by number, from caches.
 
     Returns:
-        The doubt, the factor on its sigma, and by place :func:`surest_half` of a doubt that has
-        learnt nothing of that place.
+        The doubt, the factor on its sigma, and by place :func:`surest_half` by a doubt that has
+        learnt nothing of that place (``out_of_fold``), by what the head that has not seen the
+        source tells itself (``own``), and by how far a pixel's depth is from the median (``relief``).
     """
     parts, names = [], []
     for number, fold in enumerate(folds):
@@ -221,11 +228,15 @@ def learn_doubt(
         progress(TrainStep("errors in places left out", number + 1, len(folds)))
     errors = join(parts)
     doubt = fit_doubt(errors, seed, lambda step: progress(TrainStep("uncertainty", step, _STEPS)))
-    unseen = {}
+    unseen: dict[str, dict[str, float]] = {}
     for place in errors.place.unique().tolist():
         mine = errors.place == place
-        without = fit_doubt(of_places(errors, ~mine), seed)
-        unseen[names[place]] = surest_half(without, of_places(errors, mine))
-        logger.info("uncertainty learnt without %s: surest half %.3f", names[place], unseen[names[place]])
+        without, there = fit_doubt(of_places(errors, ~mine), seed), of_places(errors, mine)
+        unseen[names[place]] = {
+            "out_of_fold": surest_half(without.judge(features_of(without, there)), there),
+            "own": surest_half(there.own, there),
+            "relief": surest_half(there.relief[:, 1], there),
+        }
+        logger.info("surest half in %s, not learnt from: %s", names[place], unseen[names[place]])
         progress(TrainStep("uncertainty without a place", len(unseen), len(errors.place.unique())))
     return doubt, sigma_scale(doubt, errors), unseen
