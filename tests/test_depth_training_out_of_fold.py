@@ -102,6 +102,13 @@ def test_folds_share_no_place_and_nothing_mixed(settings: dict[str, Any]) -> Non
         plan_folds([planned[0], replace(planned[1], view=mixed)])
 
 
+def test_too_few_sources_are_told_before_any_work(settings: dict[str, Any], tmp_path: Path) -> None:
+    config = TrainConfig.from_dict({**settings, "sources": settings["sources"][:1]})
+    with pytest.raises(ConfigError, match="'uncertainty'"):
+        loop.train_depth(config, backbone=tiny_backbone())
+    assert not (tmp_path / "cache").exists()
+
+
 def test_a_head_with_a_doubt_is_made_judged_and_planned(settings: dict[str, Any]) -> None:
     config = TrainConfig.from_dict(settings)
     plan = plan_training(config, backbone=tiny_backbone())

@@ -74,7 +74,8 @@ def train_depth(
             training killed in it need not be done again.
 
     Raises:
-        ConfigError: a place is both trained on and held out, or the device is not there.
+        ConfigError: a place is both trained on and held out, the device is not there, or there
+            are not two sources to learn uncertainty from.
         DatasetError: a place is missing or malformed.
         WeightsError: the backbone is missing or damaged.
         OutputError: the output cannot be written.
@@ -87,6 +88,7 @@ def train_depth(
         raise OutputError(f"{output.parent}: cannot be made: {error.strerror}") from error
     encoder = Encoder(backbone) if backbone is not None else open_encoder(config.backbone, device)
     planned = plan_caches(config, encoder.key, readers)
+    folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
     seen = [f"{benchmark} ({', '.join(names)})" for benchmark, names in benchmarks_seen(planned).items()]
     for benchmark in seen:
         logger.warning("trained on %s: figures of this head on it are not zero-shot", benchmark)
@@ -97,7 +99,6 @@ def train_depth(
         for k, plan in enumerate(planned)
     ]
     judging = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None]
-    folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
     dim = encoder.backbone.dim
     shape = HeadShape(
         config.head.taps, dim, config.head.dim, config.head.blocks, config.head.guide_dim, config.members,
