@@ -50,9 +50,7 @@ def variant_config(base: TrainConfig, change: dict[str, Any], *, samples: int, s
     Args:
         samples: no more than so many views of a place.
     """
-    values = config_without(
-        base, None, Path("unused"), samples=samples, overruled={"members": 1}
-    ).model_dump()
+    values = config_without(base, None, Path("unused"), samples=samples).model_dump()
     first = base.sources[0].folder
     keep = {"real": (True,), "synthetic": (False,), None: (True, False)}[change.get("sources")]
     sources = [
@@ -62,7 +60,7 @@ def variant_config(base: TrainConfig, change: dict[str, Any], *, samples: int, s
     ]
     if "mixed" in change:
         sources = [{**s, "augment": {**s["augment"], "mixed": change["mixed"]}} for s in sources]
-    values["sources"] = sources
+    values |= {"sources": sources, "members": 1}
     for name, value in change.items():
         if name in _SECTIONS:
             values[_SECTIONS[name]][name] = value

@@ -43,6 +43,23 @@ def places_of(base: TrainConfig) -> tuple[str, ...]:
     return tuple(place.name for place in base.sources[0].places)
 
 
+def unmixed(base: TrainConfig) -> TrainConfig:
+    """One head of what ``base`` does not mix: a place's features are then the same whatever is left
+    out, since nothing of the others is in them.
+
+    Raises:
+        ConfigError: everything is mixed.
+    """
+    sources = tuple(
+        source.model_copy(update={"members": None})
+        for source in base.sources
+        if not (source.augment or base.view.augment).mixed
+    )
+    if not sources:
+        raise ConfigError("the settings have no source whose views are not mixed")
+    return base.model_copy(update={"sources": sources, "members": 1})
+
+
 def config_without(
     base: TrainConfig,
     left_out: str | None,
@@ -54,7 +71,9 @@ def config_without(
     """``base`` without one place, or as it is.
 
     Each place becomes a source of its own, so that its features are shared by all trainings; a
-    source's ``limit`` is spread over its places.
+    source's ``limit`` is spread over its places. With fewer members than ``base`` has, the first ones
+    are trained, and what only the others learn from is left out. Uncertainty is the members' own:
+    learnt out of fold it would take a training for each place again.
 
     Args:
         samples: no more than so many views of a place.
@@ -65,8 +84,12 @@ def config_without(
     """
     if left_out is not None and left_out not in places_of(base):
         raise ConfigError(f"'{left_out}' cannot be left out; there are: {', '.join(places_of(base))}")
+    count = (overruled or {}).get("members", base.members)
     sources = []
     for source in base.sources:
+        members = None if source.members is None else [m for m in source.members if m < count]
+        if members == []:
+            continue
         total = sum(place.samples for place in source.places)
         share = min(1.0, source.limit / total) if source.limit else 1.0
         for place in source.places:
@@ -75,9 +98,12 @@ def config_without(
             views = max(1, round(place.samples * share))
             views = views if samples is None else min(views, samples)
             one = {**place.model_dump(), "samples": views}
-            sources.append({**source.model_dump(), "places": [one], "held_out": [], "limit": None})
+            sources.append(
+                {**source.model_dump(), "places": [one], "members": members, "held_out": [], "limit": None}
+            )
     values = {**base.model_dump(), **(overruled or {}), "sources": sources, "output": str(output)}
-    return TrainConfig.from_dict({**values, "trained_on": ""}, origin="benchmarks.depth_places")
+    values |= {"trained_on": "", "uncertainty": "own"}
+    return TrainConfig.from_dict(values, origin="benchmarks.depth_places")
 
 
 def leave_one_out(
@@ -129,6 +155,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--leave-out", nargs="*", metavar="PLACE", help="default: each of the first source")
     parser.add_argument("--zero-shot", type=Path, nargs="*", default=[], metavar="DATA")
     parser.add_argument("--first-source-only", action="store_true", help="without the synthetic rooms")
+    parser.add_argument("--unmixed", action="store_true", help="one head, of the sources that are not mixed")
     parser.add_argument("--samples", type=int, help="no more views of a place than this")
     for name in OVERRULED:
         kind = float if name == "learning_rate" else int
@@ -140,6 +167,7 @@ def main(arguments: list[str]) -> int:
     console = Console(stderr=True)
     try:
         base = TrainConfig.from_yaml(asked.config)
+        base = unmixed(base) if asked.unmixed else base
         if asked.first_source_only:
             real = tuple(s for s in base.sources if s.folder == base.sources[0].folder)
             base = base.model_copy(update={"sources": real})

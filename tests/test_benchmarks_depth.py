@@ -14,7 +14,7 @@ import torch
 from benchmarks.depth_ablation import VARIANTS, variant_config
 from benchmarks.depth_baseline_models import ConstantDepth, MeanImageDepth, PixelMlp
 from benchmarks.depth_baselines import main as baselines
-from benchmarks.depth_places import DEFAULT_CONFIG, config_without, leave_one_out, places_of
+from benchmarks.depth_places import DEFAULT_CONFIG, config_without, leave_one_out, places_of, unmixed
 from benchmarks.depth_rows import judged_row, mean_row, table
 from slamdepth.depth.dinov2_mlp import MlpHead
 from slamdepth.depth.training.config import TrainConfig
@@ -253,3 +253,22 @@ def test_a_left_out_place_is_left_out_of_every_source() -> None:
     names = [place.name for source in config.sources for place in source.places]
     assert "cafe_nyu" not in names
     assert "desk_kinect" in names
+
+
+def test_one_head_of_what_is_not_mixed() -> None:
+    base = TrainConfig.from_yaml(DEFAULT_CONFIG)
+    plain = unmixed(base)
+    assert [source.folder for source in plain.sources] == ["depth_training", "synth"]
+    config = config_without(plain, "cafe_nyu", Path("head.safetensors"))
+    assert config.members == 1
+    assert all(source.members is None and not source.augment.mixed for source in config.sources)
+    mixed = [source for source in base.sources if source.augment.mixed]
+    with pytest.raises(ConfigError, match="no source whose views are not mixed"):
+        unmixed(base.model_copy(update={"sources": tuple(mixed)}))
+
+
+def test_fewer_members_leave_out_what_only_the_others_learn_from() -> None:
+    base = TrainConfig.from_yaml(DEFAULT_CONFIG)
+    config = config_without(base, None, Path("head.safetensors"), overruled={"members": 1})
+    assert {source.members for source in config.sources} == {(0,)}
+    assert all(source.augment.mixed for source in config.sources)

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import json
+import math
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +24,7 @@ from slamdepth.depth.head import (
     load_head,
     save_head,
 )
-from slamdepth.depth.layout import check_layout, dinov2_layout
+from slamdepth.depth.layout import check_layout, dinov2_layout, pack_about
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, INPUT_AREA, focal_factor, input_size
 from slamdepth.errors import WeightsError
 from slamdepth.types import Camera
@@ -186,6 +189,33 @@ def test_head_file_round_trip(tmp_path: Path) -> None:
     first = (tmp_path / "h.safetensors").read_bytes()
     save_head(tmp_path / "h.safetensors", model, {"trained_on": "nothing"})
     assert (tmp_path / "h.safetensors").read_bytes() == first
+
+
+def test_a_doubt_says_how_sure_all_members_are_and_comes_back_from_the_file(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    model = HeadEnsemble(replace(SMALL, doubt=4), sigma_scale=2.0).eval()
+    assert model.doubt is not None
+    torch.nn.init.zeros_(model.doubt.out.weight)
+    torch.nn.init.constant_(model.doubt.out.bias, math.log(0.5) + 2)
+    args = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56)
+    save_head(tmp_path / "h.safetensors", model, {})
+    loaded, _ = load_head(tmp_path / "h.safetensors")
+    with torch.inference_mode():
+        log_depth, sigma = loaded(*args)
+        outs = [member(*args) for member in loaded.members]
+    torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
+    torch.testing.assert_close(sigma, torch.full_like(sigma, 2.0 * 2.0**0.5 * 0.5), rtol=2e-3, atol=0)
+
+
+def test_a_head_of_the_first_format_is_read(tmp_path: Path) -> None:
+    model = HeadEnsemble(SMALL)
+    tensors = {name: value.half().contiguous() for name, value in model.state_dict().items()}
+    shape = {name: value for name, value in asdict(SMALL).items() if name != "doubt"}
+    about = {"format": "slamdepth-depth-head-1", "shape": json.dumps(shape), "sigma_scale": "1.5"}
+    save_file(tensors, tmp_path / "old.safetensors", metadata=pack_about(about))
+    loaded, _ = load_head(tmp_path / "old.safetensors")
+    assert loaded.doubt is None
+    assert loaded.sigma_scale == 1.5
 
 
 def test_head_file_of_another_kind_is_refused(tmp_path: Path) -> None:

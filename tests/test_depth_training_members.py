@@ -13,6 +13,7 @@ from training_places import make_place
 
 from slamdepth.depth.head import UPSAMPLING, load_head
 from slamdepth.depth.training import loop
+from slamdepth.depth.training.caches import Encoder, plan_caches
 from slamdepth.depth.training.config import TrainConfig
 from slamdepth.depth.training.features import FeatureCache
 from slamdepth.depth.training.plan import plan_training
@@ -61,6 +62,25 @@ def test_a_member_learns_from_its_sources_alone(
 def test_a_member_without_a_place_is_an_error(settings: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="no place to train on for member 1"):
         train({**settings, "sources": settings["sources"][:1]})
+
+
+def test_a_member_that_there_is_not_is_an_error(settings: dict[str, Any]) -> None:
+    sources = [{**settings["sources"][0], "members": [7]}, *settings["sources"][1:]]
+    with pytest.raises(ConfigError, match="teach member 7, and there are members 0 to 1"):
+        TrainConfig.from_dict({**settings, "sources": sources})
+
+
+def test_what_no_member_learns_from_is_not_computed(settings: dict[str, Any]) -> None:
+    config = TrainConfig.from_dict(settings).model_copy(update={"members": 1})  # as a search does
+    planned = plan_caches(config, Encoder(tiny_backbone()).key)
+    assert [plan.places[0].name for plan in planned] == ["hall", "yard"]
+
+
+def test_features_of_another_precision_are_other_features(settings: dict[str, Any]) -> None:
+    config, backbone = TrainConfig.from_dict(settings), tiny_backbone()
+    single = plan_caches(config, Encoder(backbone).key)
+    half = plan_caches(config, Encoder(backbone.to(torch.bfloat16)).key)
+    assert not {plan.folder for plan in single} & {plan.folder for plan in half}
 
 
 def test_fine_epochs_train_the_upsampling_alone(settings: dict[str, Any]) -> None:

@@ -101,7 +101,7 @@ def test_a_damaged_checkpoint_starts_its_member_again(
 ) -> None:
     expected = loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone())
     data = expected.output.read_bytes()
-    monkeypatch.setattr(loop, "remove_checkpoints", lambda config: None)
+    monkeypatch.setattr(loop, "remove_checkpoints", lambda *_: None)
     loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone())
     files = sorted(expected.output.parent.glob("*.checkpoint"))
     files[0].write_bytes(files[0].read_bytes()[:-200])

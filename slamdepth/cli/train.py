@@ -61,6 +61,9 @@ def train_depth_command(
         result = run_training(settings, device=device, progress=progress)
     out.print(f"head: {result.output}", markup=False, soft_wrap=True)
     out.print(f"curves and samples: {report_folder(result.output)}", markup=False, soft_wrap=True)
+    for place, ratios in result.unseen_surest_half.items():
+        shown = ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items())
+        out.print(f"surest half in {place}, left out: {shown}", markup=False)
     for place, figures in result.held_out.items():
         shown = ", ".join(f"{name} {value:.3f}" for name, value in figures.items())
         out.print(f"held out {place}: {shown}", markup=False)

@@ -13,18 +13,22 @@ import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from slamdepth.depth.doubt import Doubt
 from slamdepth.depth.layout import check_layout, pack_about, unpack_about
 from slamdepth.errors import WeightsError
 
 _FACTOR = 7
 UPSAMPLING = "weights."
 """Prefix of the parameters that only the upsampling to full resolution uses."""
-FORMAT = "slamdepth-depth-head-1"
+FORMAT = "slamdepth-depth-head-2"
+_READABLE = ("slamdepth-depth-head-1", FORMAT)
+"""The first format had no ``doubt``."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,8 @@ class HeadShape:
         token_dim: width of the backbone.
         dim, blocks, guide_dim: channels and residual convolutions, see ``HeadConfig``.
         members: heads whose predictions are averaged.
+        doubt: components of the tokens read by :class:`~slamdepth.depth.doubt.Doubt`, which then
+            says how sure they are; 0 where the members themselves do.
     """
 
     taps: tuple[int, ...] = (5, 8, 11)
@@ -44,6 +50,7 @@ class HeadShape:
     blocks: int = 1
     guide_dim: int = 64
     members: int = 1
+    doubt: int = 0
 
 
 class _Residual(nn.Module):
@@ -116,9 +123,10 @@ def convex_upsample(coarse: Tensor, logits: Tensor) -> Tensor:
 class HeadEnsemble(nn.Module):
     """Heads that learnt from different seeds or sources, averaged.
 
-    Sigma is their geometric mean. What they disagree on adds nothing: heads that know different
-    things differ most in the scale of a whole image, which says nothing of its pixels, and the
-    order of pixels by certainty got worse with it.
+    Sigma is their geometric mean, or what a :class:`~slamdepth.depth.doubt.Doubt` says where the
+    shape has one. What they disagree on adds nothing: heads that know different things differ
+    most in the scale of a whole image, which says nothing of its pixels, and the order of pixels
+    by certainty got worse with it.
 
     Args:
         sigma_scale: factor that makes sigma cover 68 % of the errors on held-out places.
@@ -129,10 +137,20 @@ class HeadEnsemble(nn.Module):
         self.shape = shape
         self.sigma_scale = sigma_scale
         self.members = nn.ModuleList(DepthHead(shape) for _ in range(shape.members))
+        self.doubt: Doubt | None = Doubt(shape.token_dim, shape.doubt) if shape.doubt else None
 
     def forward(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
         """Mean log depth and its calibrated standard deviation, each ``(B, H, W)``."""
-        outs = torch.stack([member(tokens, class_tokens, image) for member in self.members])
+        members = cast("list[DepthHead]", list(self.members))
+        coarse = [member.coarse(tokens, class_tokens, image) for member in members]
+        if self.doubt is not None:
+            log_depth = torch.stack([both[:, 0] for both, _ in coarse]).mean(dim=0)
+            doubt = self.doubt(tokens[:, -1], log_depth)
+            coarse = [(torch.stack([both[:, 0], doubt], dim=1), features) for both, features in coarse]
+        outs = torch.stack([
+            convex_upsample(both, member.weights(features))
+            for member, (both, features) in zip(members, coarse, strict=True)
+        ])  # fmt: skip
         mean = outs[:, :, 0].mean(dim=0)
         # A Laplace distribution of spread b has the variance 2 b^2.
         return mean, self.sigma_scale * math.sqrt(2.0) * outs[:, :, 1].mean(dim=0).exp()
@@ -172,7 +190,7 @@ def load_head(path: Path, device: str = "cpu") -> tuple[HeadEnsemble, dict[str, 
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file: {error}") from error
-    if meta.get("format") != FORMAT:
+    if meta.get("format") not in _READABLE:
         raise WeightsError(f"{path}: not a depth head of this package (format {meta.get('format')!r})")
     try:
         values = json.loads(meta["shape"])

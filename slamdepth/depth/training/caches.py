@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from slamdepth.depth import weights as store
-from slamdepth.depth.dinov2 import DinoV2
+from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
 from slamdepth.depth.training.config import TrainConfig, ViewConfig, digest
 from slamdepth.depth.training.data import Place, PlaceReader, data_folder, open_place
 from slamdepth.depth.training.features import FeatureCache, build_cache
@@ -45,13 +45,45 @@ class PlannedCache:
     members: tuple[int, ...] | None = None
 
 
+@dataclass(frozen=True)
+class Encoder:
+    """A backbone whose features are cached.
+
+    Attributes:
+        backbone: frozen, in the precision it computes in.
+        sha256: of its file; "given" where it came from no file.
+    """
+
+    backbone: DinoV2
+    sha256: str = "given"
+
+    @property
+    def key(self) -> str:
+        """Differs where features do: bfloat16 rounds otherwise than float32."""
+        return f"{self.sha256} {self.backbone.cls_token.dtype}"
+
+
+def open_encoder(file: str | None, device: str = "cpu") -> Encoder:
+    """The backbone of ``file`` (default: the cached one), in the precision ``device`` is best at.
+
+    Raises:
+        WeightsError: it is missing or damaged.
+    """
+    path = store.find_backbone(file)
+    sha256 = store.verify(path)
+    return Encoder(load_dinov2(path, device).to(working_type(device)), sha256)
+
+
 def plan_caches(
-    config: TrainConfig, backbone_sha256: str, readers: Mapping[str, PlaceReader] | None = None
+    config: TrainConfig, encoder_key: str, readers: Mapping[str, PlaceReader] | None = None
 ) -> list[PlannedCache]:
     """Open every place of ``config`` and say what is to be computed of it.
 
+    A source that no member learns from is opened, since its places may be mixed into
+    others, but has no cache.
+
     Args:
-        backbone_sha256: of the file whose features they are.
+        encoder_key: of the backbone whose features they are, see :class:`Encoder`.
         readers: readers beside those of :mod:`slamdepth.depth.training.readers`.
 
     Raises:
@@ -70,7 +102,7 @@ def plan_caches(
 
     def where(view: ViewConfig, places: tuple[Place, ...], *more: object) -> Path:
         made_of = [place.fingerprint for place in places]
-        name = digest(view, _VIEW_VERSION, config.head.taps, config.seed, backbone_sha256, made_of, *more)
+        name = digest(view, _VIEW_VERSION, config.head.taps, config.seed, encoder_key, made_of, *more)
         return store.cache_dir() / "features" / name
 
     planned = []
@@ -106,6 +138,7 @@ def plan_caches(
         if cache.view.augment.mixed
         else cache
         for cache in planned
+        if any(_teaches(cache.members, member) for member in range(config.members))
     ]
     for folder, source in both:
         for name in source.held_out:

@@ -57,9 +57,9 @@ def load_checkpoint(path: Path, key: str, device: str) -> dict[str, Any] | None:
     return state
 
 
-def remove_checkpoints(config: TrainConfig) -> None:
-    """Remove what only a killed training needs."""
-    for member in range(config.members):
+def remove_checkpoints(config: TrainConfig, count: int) -> None:
+    """Remove what only a killed training needs, of ``count`` heads."""
+    for member in range(count):
         path = checkpoint_path(config, member)
         path.unlink(missing_ok=True)
         path.with_name(path.name + ".partial").unlink(missing_ok=True)

@@ -6,10 +6,18 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from slamdepth.errors import ConfigError
 
@@ -129,9 +137,13 @@ class TrainConfig(_Section):
         2e-3, gt=0, description="peak, in the coarse epochs and again in the fine ones"
     )
     weight_decay: float = Field(0.05, ge=0)
-    sigma_scale: float = Field(
-        1.0, gt=0, description="calibration of sigma; measured instead where there are held-out places"
+    uncertainty: Literal["own", "out_of_fold"] = Field(
+        "own", description="each member's own, or learnt from errors in sources left out once each"
     )
+    sigma_scale: float = Field(
+        1.0, gt=0,
+        description="calibration of sigma; measured instead where there are held-out places or out_of_fold",
+    )  # fmt: skip
     backbone: str | None = Field(None, description="weights file; the cached one if absent")
     trained_on: str = Field("", description="said of the head wherever it is used; its places if empty")
     licence: str = Field("unknown", description="licence of the head")
@@ -151,6 +163,19 @@ class TrainConfig(_Section):
             if name not in SEARCHABLE:
                 raise ValueError(f"'{name}' cannot be searched; choose from: {', '.join(SEARCHABLE)}")
         return search
+
+    @field_validator("sources")
+    @classmethod
+    def _have_their_members(
+        cls, sources: tuple[SourceConfig, ...], info: ValidationInfo
+    ) -> tuple[SourceConfig, ...]:
+        count = info.data.get("members")
+        for source in sources:
+            for member in source.members or ():
+                if count is not None and not 0 <= member < count:
+                    there_are = f"there are members 0 to {count - 1}"
+                    raise ValueError(f"'{source.folder}' is to teach member {member}, and {there_are}")
+        return sources
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> TrainConfig:

@@ -20,11 +20,18 @@ import numpy as np
 import torch
 from torch import nn
 
-from slamdepth.depth import weights as store
 from slamdepth.depth.checkpoints import check_device
-from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
+from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.head import UPSAMPLING, DepthHead, HeadEnsemble, HeadShape, save_head
-from slamdepth.depth.training.caches import PlannedCache, benchmarks_seen, fill_cache, of_member, plan_caches
+from slamdepth.depth.training.caches import (
+    Encoder,
+    PlannedCache,
+    benchmarks_seen,
+    fill_cache,
+    of_member,
+    open_encoder,
+    plan_caches,
+)
 from slamdepth.depth.training.checkpoint import (
     checkpoint_path,
     load_checkpoint,
@@ -37,6 +44,7 @@ from slamdepth.depth.training.data import PlaceReader
 from slamdepth.depth.training.features import FeatureCache, load_batch
 from slamdepth.depth.training.judge import held_out_figures, judge, sample_views
 from slamdepth.depth.training.losses import total_loss
+from slamdepth.depth.training.out_of_fold import COMPONENTS, learn_doubt, plan_folds
 from slamdepth.depth.training.progress import Progress, TrainStep, silent
 from slamdepth.depth.training.results import EpochFigures, TrainResult
 from slamdepth.depth.training.stages import FINE_COST, predict
@@ -66,7 +74,8 @@ def train_depth(
             training killed in it need not be done again.
 
     Raises:
-        ConfigError: a place is both trained on and held out, or the device is not there.
+        ConfigError: a place is both trained on and held out, the device is not there, or there
+            are not two sources to learn uncertainty from.
         DatasetError: a place is missing or malformed.
         WeightsError: the backbone is missing or damaged.
         OutputError: the output cannot be written.
@@ -77,24 +86,23 @@ def train_depth(
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{output.parent}: cannot be made: {error.strerror}") from error
-    backbone_sha256 = "given"
-    if backbone is None:
-        file = store.find_backbone(config.backbone)
-        backbone_sha256 = store.verify(file)
-        backbone = load_dinov2(file, device).to(working_type(device))
-
-    planned = plan_caches(config, backbone_sha256, readers)
+    encoder = Encoder(backbone) if backbone is not None else open_encoder(config.backbone, device)
+    planned = plan_caches(config, encoder.key, readers)
+    folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
     seen = [f"{benchmark} ({', '.join(names)})" for benchmark, names in benchmarks_seen(planned).items()]
     for benchmark in seen:
         logger.warning("trained on %s: figures of this head on it are not zero-shot", benchmark)
     caches = [
-        fill_cache(plan, config, backbone, device=device, progress=progress, stage=_stage(plan, k, planned))
+        fill_cache(
+            plan, config, encoder.backbone, device=device, progress=progress, stage=_stage(plan, k, planned)
+        )
         for k, plan in enumerate(planned)
     ]
     judging = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None]
+    dim = encoder.backbone.dim
     shape = HeadShape(
-        config.head.taps, backbone.dim, config.head.dim, config.head.blocks, config.head.guide_dim,
-        config.members,
+        config.head.taps, dim, config.head.dim, config.head.blocks, config.head.guide_dim, config.members,
+        min(COMPONENTS, dim) if folds else 0,
     )  # fmt: skip
     key = digest(config, [plan.folder.name for plan in planned])
     ensemble = HeadEnsemble(shape)
@@ -104,6 +112,19 @@ def train_depth(
         head, epochs = _train_member(config, training, judging, shape, member, key, device, progress)
         ensemble.members[member].load_state_dict(head.state_dict())
         history += epochs
+    unseen: dict[str, dict[str, float]] = {}
+    ensemble.sigma_scale = config.sigma_scale
+    if folds:
+
+        def of_fold(number: int, training: list[FeatureCache]) -> DepthHead:
+            alone, place = config.model_copy(update={"fine_epochs": 0}), config.members + number
+            return _train_member(alone, training, [], shape, place, key, device, progress)[0]
+
+        doubt, ensemble.sigma_scale, unseen = learn_doubt(
+            planned, caches, folds, of_fold, seed=config.seed, device=device, progress=progress
+        )
+        assert ensemble.doubt is not None
+        ensemble.doubt.load_state_dict(doubt.state_dict())
     ensemble.eval().to(device)
 
     held_out, ratios = {}, []
@@ -111,8 +132,7 @@ def train_depth(
         if plan.held_out is not None:
             held_out[plan.held_out], ratio = judge(ensemble, cache, device)
             ratios.append(ratio)
-    ensemble.sigma_scale = config.sigma_scale
-    if ratios:
+    if ratios and not folds:
         # Each place counts the same: the mean over places of the ratio that covers 68 %.
         ensemble.sigma_scale = float(np.mean([np.quantile(ratio, _ONE_SIGMA) for ratio in ratios]))
     names = ", ".join(place.name for source in config.sources for place in source.places)
@@ -121,18 +141,18 @@ def train_depth(
         "licence": config.licence,
         "seed": str(config.seed),
         "settings": json.dumps(config.model_dump(mode="json"), sort_keys=True),
-        "backbone_sha256": backbone_sha256,
+        "backbone_sha256": encoder.sha256,
     }
     result = TrainResult(
         output, tuple(history), held_out, ensemble.sigma_scale,
-        sample_views(ensemble, planned, caches, _SAMPLES, device), _places(planned), about,
+        sample_views(ensemble, planned, caches, _SAMPLES, device), _places(planned), about, unseen,
     )  # fmt: skip
     try:
         save_head(output, ensemble, about)
         sync_file(output)
         if on_result is not None:
             on_result(result)
-        remove_checkpoints(config)
+        remove_checkpoints(config, config.members + len(folds))
     except OSError as error:
         raise OutputError(f"{output}: cannot be written: {error.strerror}") from error
     return result
@@ -256,7 +276,9 @@ def _how_far(config: TrainConfig, member: int, epoch: int, step: int, steps: int
     total = steps * (config.coarse_epochs + FINE_COST * config.fine_epochs)
     epochs = config.coarse_epochs + config.fine_epochs
     detail = f"epoch {epoch + 1} of {epochs}, loss {loss:.4f}"
-    return TrainStep(f"member {member + 1} of {config.members}", done, total, detail)
+    left_out = member - config.members  # beyond the members are the heads without a source each
+    what = f"without source {left_out + 1}" if left_out >= 0 else f"member {member + 1} of {config.members}"
+    return TrainStep(what, done, total, detail)
 
 
 def learning_rate(config: TrainConfig, epoch: float) -> float:

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from slamdepth.depth import weights as store
 from slamdepth.depth.checkpoints import check_device
-from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
+from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.head import DepthHead, HeadShape
 from slamdepth.depth.preprocess import PATCH
-from slamdepth.depth.training.caches import benchmarks_seen, of_member, plan_caches
+from slamdepth.depth.training.caches import Encoder, benchmarks_seen, of_member, open_encoder, plan_caches
 from slamdepth.depth.training.config import TrainConfig
 from slamdepth.depth.training.data import PlaceReader
 from slamdepth.depth.training.features import encode, sample_specs
 from slamdepth.depth.training.loop import steps_per_epoch
 from slamdepth.depth.training.losses import total_loss
+from slamdepth.depth.training.out_of_fold import plan_folds
 from slamdepth.depth.training.stages import predict
 from slamdepth.depth.training.store import bytes_per_sample, done_on_disk
 from slamdepth.errors import WeightsError
@@ -82,15 +82,13 @@ def plan_training(
         ConfigError, DatasetError: as :func:`~slamdepth.depth.training.caches.plan_caches`.
     """
     check_device(device)
-    backbone_sha256, missing = "given", None
-    if backbone is None:
-        try:
-            file = store.find_backbone(config.backbone)
-            backbone_sha256 = store.verify(file)
-            backbone = load_dinov2(file, device).to(working_type(device))
-        except WeightsError as error:
-            missing = str(error)
-    planned = plan_caches(config, backbone_sha256, readers)
+    encoder, missing = None, None
+    try:
+        encoder = Encoder(backbone) if backbone is not None else open_encoder(config.backbone, device)
+    except WeightsError as error:
+        missing = str(error)
+    backbone = encoder.backbone if encoder else None
+    planned = plan_caches(config, encoder.key if encoder else "missing", readers)
     dim, patch = (backbone.dim, backbone.patch) if backbone else (HeadShape().token_dim, PATCH)
     specs = sample_specs(config.view, config.head.taps, dim, patch)
     sources = tuple(
@@ -109,15 +107,19 @@ def plan_training(
         steps_per_epoch(config, sum(len(plan.keys) for plan in of_member(planned, planned, member)))
         for member in range(config.members)
     )
+    folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
+    fold_steps = config.coarse_epochs * sum(
+        steps_per_epoch(config, sum(len(planned[k].keys) for k in fold.learnt)) for fold in folds
+    )
     features_s = training_s = None
     if backbone is not None:
         todo = sum(source.samples - source.cached for source in sources)
         features_s = todo * _view_s(config, backbone, device) if todo else 0.0
         coarse_s, fine_s = _step_s(config, dim, patch, device)
         epoch_s = config.coarse_epochs * coarse_s + config.fine_epochs * fine_s
-        training_s = steps * epoch_s
-    epochs = config.coarse_epochs + config.fine_epochs
-    return TrainingPlan(sources, epochs * steps, features_s, training_s, missing, benchmarks_seen(planned))
+        training_s = steps * epoch_s + fold_steps * coarse_s
+    total = steps * (config.coarse_epochs + config.fine_epochs) + fold_steps
+    return TrainingPlan(sources, total, features_s, training_s, missing, benchmarks_seen(planned))
 
 
 def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,6 +67,9 @@ class TrainResult:
         places: every place trained on or held out, with how many samples of it and what was
             noted while opening it.
         about: what the head file's header says.
+        unseen_surest_half: by place and by what is taken for doubt, see
+            :func:`~slamdepth.depth.training.out_of_fold.learn_doubt`, error of the surest half of
+            pixels over that of all; empty where members tell their own.
     """
 
     output: Path
@@ -76,6 +79,7 @@ class TrainResult:
     samples: tuple[SampleView, ...]
     places: tuple[dict[str, Any], ...]
     about: dict[str, str]
+    unseen_surest_half: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @property
     def losses(self) -> NDArray[np.float64]:

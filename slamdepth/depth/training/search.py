@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from slamdepth.depth import weights as store
-from slamdepth.depth.training.caches import plan_caches
+from slamdepth.depth.training.caches import Encoder, open_encoder, plan_caches
 from slamdepth.depth.training.config import SEARCHABLE, SearchRange, TrainConfig, digest
 from slamdepth.depth.training.data import PlaceReader
 from slamdepth.depth.training.loop import train_depth
@@ -95,8 +94,8 @@ def search_settings(
     output = Path(config.output)
     study_file = output.with_name(f"{output.stem}_search.sqlite3")
     folder = output.with_name(f"{output.stem}_search")
-    sha256 = "given" if backbone is not None else store.verify(store.find_backbone(config.backbone))
-    planned = plan_caches(config, sha256, readers)
+    encoder = Encoder(backbone) if backbone is not None else open_encoder(config.backbone, device)
+    planned = plan_caches(config, encoder.key, readers)
     with locked(folder):
         name = digest(config, [plan.folder.name for plan in planned])
         study = _open_study(optuna, study_file, name)
@@ -104,10 +103,12 @@ def search_settings(
             study.sampler = optuna.samplers.TPESampler(seed=config.seed * 100_003 + number)
             trial = study.ask()
             tried = {key: _suggest(trial, key, where) for key, where in config.search.items()}
-            settings = with_settings(config, {**tried, "members": 1})
-            settings = settings.model_copy(
-                update={"output": str(folder / f"trial_{number:04d}.safetensors"), "search": {}}
-            )
+            settings = with_settings(config, tried).model_copy(
+                update={
+                    "output": str(folder / f"trial_{number:04d}.safetensors"),
+                    "search": {}, "members": 1, "uncertainty": "own",
+                }
+            )  # fmt: skip
 
             def tell(result: TrainResult, trial: Any = trial) -> None:
                 trial.set_user_attr(_HELD_OUT, json.dumps(result.held_out))

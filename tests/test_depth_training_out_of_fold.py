@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Uncertainty learnt from errors in places that the predicting head had not seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from killed_training import tiny_backbone
+from training_places import make_place
+
+from slamdepth.depth.doubt import RELIEF, Doubt, relief
+from slamdepth.depth.head import load_head
+from slamdepth.depth.training import loop, out_of_fold
+from slamdepth.depth.training.caches import Encoder, plan_caches
+from slamdepth.depth.training.config import AugmentConfig, TrainConfig
+from slamdepth.depth.training.out_of_fold import Errors, Fold, fit_doubt, plan_folds, sigma_scale, surest_half
+from slamdepth.depth.training.plan import plan_training
+from slamdepth.depth.training.progress import TrainStep
+from slamdepth.errors import ConfigError
+
+
+@pytest.fixture
+def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    monkeypatch.setenv("SLAMDEPTH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(out_of_fold, "_STEPS", 15)
+    data = str(tmp_path / "data")
+    sources = []
+    for count, name in enumerate(("hall", "loft"), start=2):
+        make_place(tmp_path / "data" / name, count)
+        sources.append({"folder": data, "places": [{"name": name, "samples": 4}]})
+    mixed = {**sources[0], "augment": {"mixed": 1.0}}
+    return {
+        "output": str(tmp_path / "head.safetensors"),
+        "uncertainty": "out_of_fold",
+        "coarse_epochs": 2,
+        "fine_epochs": 1,
+        "batch": 4,
+        "sources": [*sources, mixed],
+        "view": {"rows": 42, "columns": 56},
+        "head": {"taps": [0, 1], "dim": 16, "guide_dim": 8},
+    }
+
+
+def made_up_errors(seed: int = 0, places: int = 3) -> Errors:
+    """Errors six times as large where the first channel of the tokens is 1 as where it is -1."""
+    torch.manual_seed(seed)
+    count = 6000
+    side = torch.where(torch.rand(count) < 0.5, -1.0, 1.0)
+    tokens = torch.cat([side[:, None], 0.05 * torch.randn(count, 7)], dim=1)
+    size = 0.1 * 6 ** ((side + 1) / 2)
+    error = size * torch.distributions.Laplace(0.0, 1.0).sample((count,)).abs()
+    view = torch.arange(count) // 100
+    means = torch.stack([error[view == k].mean() for k in range(count // 100)])[view]
+    own = torch.randn(count)
+    return Errors(tokens.half(), torch.randn(count, RELIEF), error, error / means, own, view % places, view)
+
+
+def test_it_learns_where_errors_are_large_and_how_large() -> None:
+    doubt = fit_doubt(made_up_errors(), seed=0)
+    other = made_up_errors(seed=1)
+    features = out_of_fold.features_of(doubt, other)
+    assert surest_half(doubt.judge(features), other) < 0.4  # of 1 and 6 in equal parts: 1 / 3.5 = 0.29
+    assert surest_half(other.own, other) == pytest.approx(1, abs=0.1)
+    spread, is_large = doubt.judge(features).exp(), other.tokens[:, 0] > 0
+    assert spread[is_large].median() / spread[~is_large].median() == pytest.approx(6, rel=0.25)
+    assert spread[~is_large].median() == pytest.approx(0.1, rel=0.2)
+    # 68 % of a Laplace distribution lie within 1.15 of its spread, 0.81 of its deviation
+    assert sigma_scale(doubt, other) == pytest.approx(0.81, rel=0.1)
+
+
+def test_the_map_is_read_as_its_pixels_are() -> None:
+    torch.manual_seed(0)
+    doubt = fit_doubt(made_up_errors(), seed=0)
+    tokens, log_depth = torch.randn(2, 8, 3, 4), torch.randn(2, 6, 8)
+    whole = doubt(tokens, log_depth)
+    assert whole.shape == (2, 6, 8)
+    seen = doubt.basis @ (tokens[1, :, 2, 1] - doubt.centre)
+    one = torch.cat([seen, doubt.scaled(relief(log_depth))[1, 5, 2]])
+    torch.testing.assert_close(whole[1, 5, 2], doubt.judge(one))
+
+
+def test_relief_is_free_of_the_scale_of_a_frame() -> None:
+    log_depth = torch.randn(1, 6, 9)
+    torch.testing.assert_close(relief(log_depth + 0.7), relief(log_depth), atol=1e-4, rtol=1e-4)
+    ramp = torch.linspace(-1, 1, 9)[None, None].expand(1, 6, 9)
+    torch.testing.assert_close(relief(ramp)[0, 0, :, 0], ramp[0, 0])
+    torch.testing.assert_close(relief(ramp)[..., 4], torch.full((1, 6, 9), 0.25))  # across
+    torch.testing.assert_close(relief(ramp)[..., 3], torch.zeros(1, 6, 9))  # down
+
+
+def test_folds_share_no_place_and_nothing_mixed(settings: dict[str, Any]) -> None:
+    planned = plan_caches(TrainConfig.from_dict(settings), Encoder(tiny_backbone()).key)
+    assert plan_folds(planned) == [Fold((1,), 0), Fold((0,), 1)]
+    twice = [*planned[:2], replace(planned[0], view=planned[0].view.model_copy())]
+    assert plan_folds(twice) == [Fold((1,), 0), Fold((0, 2), 1), Fold((1,), 2)]
+    mixed = planned[1].view.model_copy(update={"augment": AugmentConfig(mixed=0.1)})
+    with pytest.raises(ConfigError, match="two sources of different places whose views are not mixed"):
+        plan_folds([planned[0], replace(planned[1], view=mixed)])
+
+
+def test_too_few_sources_are_told_before_any_work(settings: dict[str, Any], tmp_path: Path) -> None:
+    config = TrainConfig.from_dict({**settings, "sources": settings["sources"][:1]})
+    with pytest.raises(ConfigError, match="'uncertainty'"):
+        loop.train_depth(config, backbone=tiny_backbone())
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_head_with_a_doubt_is_made_judged_and_planned(settings: dict[str, Any]) -> None:
+    config = TrainConfig.from_dict(settings)
+    plan = plan_training(config, backbone=tiny_backbone())
+    assert plan.steps == 3 * 3 + 2 * (1 + 1)  # 12 views; each fold has the 4 of the other source
+    result = loop.train_depth(config, backbone=tiny_backbone())
+    head, _ = load_head(result.output)
+    assert isinstance(head.doubt, Doubt)
+    assert head.sigma_scale == result.sigma_scale > 0
+    assert set(result.unseen_surest_half) == {"hall", "loft"}
+    assert set(result.unseen_surest_half["loft"]) == {"out_of_fold", "own", "relief"}
+    own = loop.train_depth(config.model_copy(update={"uncertainty": "own"}), backbone=tiny_backbone())
+    without, _ = load_head(own.output)
+    depth, sigma = (a - b for a, b in zip(outputs(head), outputs(without), strict=True))
+    assert float(depth.abs().max()) == 0  # depth is the members'
+    assert float(sigma.abs().max()) > 0
+
+
+def outputs(head: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    torch.manual_seed(0)
+    with torch.inference_mode():
+        return head(torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56))
+
+
+@pytest.mark.parametrize("stage", ["member 1 of 1", "without source 2", "uncertainty", "uncertainty without"])
+def test_interrupted_it_goes_on_to_the_same_bytes(
+    settings: dict[str, Any], stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TrainConfig.from_dict(settings)
+    whole = loop.train_depth(config, backbone=tiny_backbone()).output.read_bytes()
+
+    def interrupt(step: TrainStep) -> None:
+        if step.stage.startswith(stage):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        loop.train_depth(config, progress=interrupt, backbone=tiny_backbone())
+    epochs: list[int] = []
+    real = loop._epoch
+    monkeypatch.setattr(loop, "_epoch", lambda *a: (epochs.append(a[5]), real(*a))[1])
+    again = loop.train_depth(config, backbone=tiny_backbone())
+    assert again.output.read_bytes() == whole
+    assert epochs == {"member 1 of 1": [0, 0, 0, 1, 1, 2, 2], "without source 2": [2, 2]}.get(stage, [])
+    assert not list(again.output.parent.glob("*.checkpoint"))
