@@ -75,7 +75,7 @@ class BundleConfig(_Section):
     fixed: int = Field(6, ge=1, description="further keyframes that hold the window in place")
     final: bool = Field(True, description="adjust the whole map once at the end")
     prior_inflation: float = Field(
-        2.0,
+        6.0,
         ge=1,
         description="predicted depths of neighbouring pixels err together, so each counts this much less",
     )
