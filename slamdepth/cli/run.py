@@ -49,6 +49,14 @@ def run_command(
             "sequence's ground truth says.",
         ),
     ] = None,
+    adapt: Annotated[
+        bool,
+        typer.Option(
+            "--adapt",
+            help="Experimental: let the map's points teach the depth model (dinov2) while it runs; measured: "
+            "better on fr1_desk, a bit worse on fr1_rpy (docs/depth.md). Example: slamdepth run SEQ --adapt",
+        ),
+    ] = False,
     camera_height: Annotated[
         float | None, typer.Option(metavar="M", help="First camera's height over the floor in metres.")
     ] = None,
@@ -126,7 +134,7 @@ def run_command(
                 "weights": _text(features_weights),
                 "matcher": _text(features_matcher),
             },
-            "depth": {"name": depth, "weights": _text(depth_weights)},
+            "depth": {"name": depth, "weights": _text(depth_weights), "adapt": adapt or None},
             "scale": {
                 "depth": depth_scale,
                 "camera_height_m": camera_height,

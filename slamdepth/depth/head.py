@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import cast
@@ -51,6 +52,33 @@ class HeadShape:
     guide_dim: int = 64
     members: int = 1
     doubt: int = 0
+
+
+@dataclass(frozen=True)
+class HeadFeatures:
+    """All that is left to decode.
+
+    Attributes:
+        seen: ``(members, B, guide_dim, H/7, W/7)`` what each member's last layers read.
+        doubt: ``(B, H/7, W/7)`` log spread common to the members; None where each has its own.
+    """
+
+    seen: Tensor
+    doubt: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class LastLayerChange:
+    """How log depth differs from what was trained.
+
+    Attributes:
+        weights: ``(members, guide_dim)`` added to those of the last layer; what that does to an
+            image's mean log depth is taken out again.
+        offset: added to log depth everywhere.
+    """
+
+    weights: Tensor
+    offset: float = 0.0
 
 
 class _Residual(nn.Module):
@@ -108,6 +136,20 @@ class DepthHead(nn.Module):
         coarse, features = self.coarse(tokens, class_tokens, image)
         return convex_upsample(coarse, self.weights(features))
 
+    def decode(self, features: Tensor, doubt: Tensor | None = None, change: Tensor | None = None) -> Tensor:
+        """What :meth:`forward` gives, from the features of :meth:`coarse`.
+
+        Args:
+            doubt: ``(B, H/7, W/7)`` log spread to take instead of its own.
+            change: ``(guide_dim,)`` weights for log depth; what they say is a third channel.
+        """
+        coarse = self.out(features)
+        if doubt is not None:
+            coarse = torch.stack([coarse[:, 0], doubt], dim=1)
+        if change is not None:
+            coarse = torch.cat([coarse, torch.einsum("c,bchw->bhw", change, features)[:, None]], dim=1)
+        return convex_upsample(coarse, self.weights(features))
+
 
 def convex_upsample(coarse: Tensor, logits: Tensor) -> Tensor:
     """``coarse (B, C, h, w)`` at 7 times the size; ``logits (B, 9 * 49, h, w)`` choose among
@@ -141,19 +183,37 @@ class HeadEnsemble(nn.Module):
 
     def forward(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
         """Mean log depth and its calibrated standard deviation, each ``(B, H, W)``."""
-        members = cast("list[DepthHead]", list(self.members))
-        coarse = [member.coarse(tokens, class_tokens, image) for member in members]
-        if self.doubt is not None:
-            log_depth = torch.stack([both[:, 0] for both, _ in coarse]).mean(dim=0)
-            doubt = self.doubt(tokens[:, -1], log_depth)
-            coarse = [(torch.stack([both[:, 0], doubt], dim=1), features) for both, features in coarse]
+        return self.decode(self.features(tokens, class_tokens, image))
+
+    @property
+    def _heads(self) -> Sequence[DepthHead]:
+        return cast("Sequence[DepthHead]", self.members)
+
+    def features(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> HeadFeatures:
+        """What the members' last layers read, and the common doubt where there is one."""
+        seen = torch.stack([member.coarse(tokens, class_tokens, image)[1] for member in self._heads])
+        if self.doubt is None:
+            return HeadFeatures(seen)
+        return HeadFeatures(seen, self.doubt(tokens[:, -1], self.coarse_log_depth(seen)))
+
+    def decode(self, features: HeadFeatures, change: LastLayerChange | None = None) -> tuple[Tensor, Tensor]:
+        """What :meth:`forward` gives, from :meth:`features`."""
+        changes = [None] * len(self.members) if change is None else change.weights
         outs = torch.stack([
-            convex_upsample(both, member.weights(features))
-            for member, (both, features) in zip(members, coarse, strict=True)
+            member.decode(seen, features.doubt, own)
+            for member, seen, own in zip(self._heads, features.seen, changes, strict=True)
         ])  # fmt: skip
         mean = outs[:, :, 0].mean(dim=0)
+        if change is not None:
+            relief = outs[:, :, 2].mean(dim=0)
+            mean = mean + relief - relief.mean(dim=(1, 2), keepdim=True) + change.offset
         # A Laplace distribution of spread b has the variance 2 b^2.
         return mean, self.sigma_scale * math.sqrt(2.0) * outs[:, :, 1].mean(dim=0).exp()
+
+    def coarse_log_depth(self, seen: Tensor) -> Tensor:
+        """Mean log depth ``(B, H/7, W/7)`` of the members before the upsampling."""
+        outs = [member.out(own)[:, 0] for member, own in zip(self._heads, seen, strict=True)]
+        return torch.stack(outs).mean(dim=0)
 
 
 def save_head(path: Path, model: HeadEnsemble, about: dict[str, str]) -> None:

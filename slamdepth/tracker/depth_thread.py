@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
+from slamdepth.depth.adaptation import AdaptingDepthModel, TaughtView
 from slamdepth.depth.base import DepthModel
 from slamdepth.tracker.threads import one_thread_here
-from slamdepth.types import DepthPrediction, Frame
+from slamdepth.types import Adaptation, DepthPrediction, Frame
 
 
 class DepthThread:
@@ -43,6 +45,18 @@ class DepthThread:
         assert self._asked is not None
         self._taken = frame
         return self._asked[1].result()
+
+    def again(self, frame: Frame, *, as_trained: bool = False) -> DepthPrediction:
+        """The prediction of a model that learns for a frame asked for long ago: with what it has learnt
+        since, or without any of it."""
+        assert isinstance(self._model, AdaptingDepthModel)
+        predict = self._model.predict_as_trained if as_trained else self._model.predict
+        return self._pool.submit(predict, frame).result()
+
+    def adapt(self, views: Sequence[TaughtView]) -> Future[Adaptation]:
+        """Let a model that learns do so: after all predictions asked for, before those to come."""
+        assert isinstance(self._model, AdaptingDepthModel)
+        return self._pool.submit(self._model.adapt, views)
 
     def close(self) -> None:
         """End the thread."""

@@ -20,6 +20,7 @@ from slamdepth.frontend.features import Features
 from slamdepth.geometry import orthonormalised, rotation_angle_rad
 from slamdepth.mapping.keyframe_store import KeyframeStore
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.tracker.adaptation import MapTeaching
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
@@ -67,6 +68,7 @@ class Keyframes:
 
     Args:
         watch: measures the stages.
+        teaching: told of every keyframe that has joined; None where the depth model learns nothing.
 
     Attributes:
         store: where their images lie.
@@ -83,6 +85,7 @@ class Keyframes:
         depth: DepthThread,
         shutter: Shutter,
         watch: Stopwatch,
+        teaching: MapTeaching | None = None,
     ) -> None:
         self._config = config
         self._map = landmarks
@@ -95,6 +98,7 @@ class Keyframes:
         self._timed = watch.timed
         self.store = KeyframeStore(config.map.keyframe_memory_mib)
         self._reference: MapKeyframe | None = None  # an earlier keyframe that shows the same
+        self._teaching = teaching
         self._reference_overlap = 0.0
         self._still = 0
         self._seen_share = 1.0  # of what the last keyframe knew, when its own points were born
@@ -215,6 +219,9 @@ class Keyframes:
         with self._timed("mapping"):
             self._mapper.cull(keyframe)
             self.store.tidy(self._map.keyframes)
+        if self._teaching is not None:
+            with self._timed("teaching"):
+                self._teaching.keyframe_joined()
         if self._reference_overlap > 0:
             self._seen_share = max(self._still / self._reference_overlap, 0.1)
         self._reference, self._reference_overlap = None, 0.0

@@ -108,6 +108,11 @@ class LocalMapper:
         R = T_world_camera[:3, :3]
         self._map.add_points(keyframe, born, transform(T_world_camera, position_c), R @ covariance_c @ R.T)
 
+    def predict_anew(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
+        """Exchange a keyframe's prediction for another; its points stay."""
+        keyframe.prediction = _compact(prediction)
+        keyframe.predicted_log_depth, _ = log_depth_at(prediction, keyframe.features.raw_px)
+
     def depth_field(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> DepthField:
         """The keyframe's ``prediction`` tied to the well-known points it sees."""
         seen = np.flatnonzero(keyframe.point_ids >= 0)

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.config import Config
+from slamdepth.depth.adaptation import adapting
 from slamdepth.depth.base import DepthModel
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.rolling_shutter import velocity_between
 from slamdepth.geometry import invert, so3_exp, so3_log
 from slamdepth.mapping.landmarks import LandmarkMap
+from slamdepth.tracker.adaptation import MapTeaching, in_words
 from slamdepth.tracker.checks import check_frame, model_for
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.finish import build_reconstruction, optimise_everything
@@ -77,7 +79,8 @@ class Tracker:
     ) -> None:
         self.camera = camera
         self.config = config or Config()
-        self._depth = DepthThread(model_for(depth_model, self.config))
+        model = model_for(depth_model, self.config)
+        self._depth = DepthThread(adapting(model) if self.config.depth.adapt else model)
         self._preparation = Preparation(camera, self.config.features)
         self._watch = Stopwatch()
         self._map = LandmarkMap()
@@ -89,6 +92,8 @@ class Tracker:
         self._rescue = CloudRescue(camera, self.config, self._map)
         self._retry = Retry()
         self._log = FrameLog(camera, self._map)
+        adapt = self.config.depth.adapt
+        self._teaching = MapTeaching(self._map, self._mapper, self._depth) if adapt else None
         self._keyframes = Keyframes(
             self.config,
             self._map,
@@ -99,6 +104,7 @@ class Tracker:
             self._depth,
             self._shutter,
             self._watch,
+            self._teaching,
         )
         self._last: Placement | None = None
         self._velocity = np.eye(4)  # T_camera(now)_camera(before)
@@ -355,12 +361,15 @@ class Tracker:
         self._watch.next_frame()
         with one_blas_thread():
             self._join()
-            self._depth.close()
+            if self._teaching:
+                self._teaching.set_back()
             with self._watch.timed("final"):
                 notes, votes = optimise_everything(
                     self._map, self._mapper, self._adjuster, self._log, self._shutter, self.config
                 )
-            return build_reconstruction(
+            learnt = self._teaching.finish() if self._teaching else None
+            notes += [in_words(learnt)] if learnt else []
+            made = build_reconstruction(
                 self._map,
                 self._mapper,
                 self._log,
@@ -373,4 +382,9 @@ class Tracker:
                 timings_ms=self._watch.mean_ms(),
                 notes=notes,
                 scale_votes=votes,
+                adaptation=learnt,
             )
+            if self._teaching:
+                made = self._teaching.predict_anew(made)
+            self._depth.close()
+            return made
