@@ -54,7 +54,7 @@ def run_command(
         typer.Option(
             "--adapt",
             help="Experimental: let the map's points teach the depth model (dinov2) while it runs; measured: "
-            "better on fr1_desk, a bit worse on fr1_rpy (docs/depth.md). Example: slamdepth run SEQ --adapt",
+            "no gain on fr1_desk and fr1_rpy, see docs/depth.md. Example: slamdepth run SEQ --adapt",
         ),
     ] = False,
     camera_height: Annotated[

@@ -137,10 +137,10 @@ class AdaptingDinov2:
 
     def _samples(self, view: TaughtView) -> _Samples:
         kept = self._kept[view.frame.index]
-        height, width = view.frame.image_rgb.shape[:2]
+        camera = view.frame.camera
         device = kept.log_depth.device
         # pixels have integer centres; grid_sample's -1 and 1 are the image's outer edges
-        size = torch.tensor([width, height], dtype=torch.float32, device=device)
+        size = torch.tensor([camera.width, camera.height], dtype=torch.float32, device=device)
         at = (torch.as_tensor(view.px, dtype=torch.float32, device=device) + 0.5) / size * 2.0 - 1.0
         members = len(kept.features)
         grids = torch.cat([kept.features.float().flatten(0, 2) / members, kept.log_depth[None]])
