@@ -40,8 +40,8 @@ _REWEIGHTINGS = 3
 
 @dataclass(frozen=True)
 class _Kept:
-    """Of one view: features ``(members, 1, C, h, w)`` in half precision, the members' common doubt, their mean and variance over the
-    image ``(members * C,)``, log depth ``(h, w)`` as trained."""
+    """Of one view: features ``(members, 1, C, h, w)`` in half precision, the members' common doubt, mean and
+    variance of the features over the image ``(members * C,)``, log depth ``(h, w)`` as trained."""
 
     features: Tensor
     doubt: Tensor | None
