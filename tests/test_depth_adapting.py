@@ -15,7 +15,8 @@ from test_depth_models import tiny_model
 from slamdepth.depth import adapting as module
 from slamdepth.depth.adaptation import AdaptingDepthModel, TaughtView, adapting
 from slamdepth.depth.adapting import AdaptingDinov2
-from slamdepth.depth.head import LastLayerChange
+from slamdepth.depth.dinov2 import DinoV2
+from slamdepth.depth.head import HeadEnsemble, HeadShape, LastLayerChange
 from slamdepth.depth.model import Dinov2Depth
 from slamdepth.depth.scale import DepthScale
 from slamdepth.depth.scaled import ScaledDepth
@@ -100,6 +101,19 @@ def test_it_starts_as_what_it_was() -> None:
     assert isinstance(learner, AdaptingDepthModel)
     assert (learner.name, learner.kind, learner.weights) == ("dinov2", model().kind, model().weights)
     assert equal(learner.predict(frame(0)), model().predict(frame(0)))
+
+
+def test_a_common_doubt_stays_what_it_was() -> None:
+    torch.manual_seed(0)
+    backbone = DinoV2(dim=24, depth=2, heads=3, grid=5).eval().requires_grad_(False)
+    head = HeadEnsemble(HeadShape((0, 1), 24, 16, 1, 8, members=2, doubt=4)).eval().requires_grad_(False)
+    doubting = Dinov2Depth(backbone, head, ())
+    learner = adapting(doubting)
+    first = doubting.predict(frame(0))
+    assert equal(learner.predict(frame(0)), first)
+    again = learner.predict(frame(0))  # from kept features
+    np.testing.assert_allclose(again.sigma_log, first.sigma_log, rtol=1e-4)
+    np.testing.assert_allclose(again.values, first.values, rtol=5e-3)
 
 
 def test_a_change_of_nothing_changes_nothing() -> None:

@@ -40,11 +40,11 @@ _REWEIGHTINGS = 3
 
 @dataclass(frozen=True)
 class _Kept:
-    """Of one view: features ``(members, 1, C, h, w)`` in half precision, their mean and variance over the
-    image ``(members * C,)``, log depth ``(h, w)`` as trained."""
+    """Of one view: features ``(members, 1, C, h, w)`` in half precision, the members' common doubt, mean and
+    variance of the features over the image ``(members * C,)``, log depth ``(h, w)`` as trained."""
 
     features: Tensor
-    log_spread: Tensor | None
+    doubt: Tensor | None
     mean: Tensor
     variance: Tensor
     log_depth: Tensor
@@ -95,7 +95,7 @@ class AdaptingDinov2:
     def _features(self, frame: Frame) -> HeadFeatures:
         kept = self._kept.get(frame.index)
         if kept is not None:
-            return HeadFeatures(kept.features.float(), kept.log_spread)
+            return HeadFeatures(kept.features.float(), kept.doubt)
         features = self._model.features(frame)
         self._keep(frame.index, features)
         return features
@@ -122,10 +122,10 @@ class AdaptingDinov2:
 
     def _keep(self, index: int, features: HeadFeatures) -> None:
         """Keep a view's features; of too many drop the one that stands closest between its neighbours."""
-        flat = features.members.flatten(0, 2).flatten(1)
+        flat = features.seen.flatten(0, 2).flatten(1)
         self._kept[index] = _Kept(
-            features.members.half(),
-            features.log_spread,
+            features.seen.half(),
+            features.doubt,
             flat.mean(dim=1),
             flat.var(dim=1, correction=0),
             self._model.coarse_log_depth(features),

@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -55,6 +55,19 @@ class HeadShape:
 
 
 @dataclass(frozen=True)
+class HeadFeatures:
+    """All that is left to decode.
+
+    Attributes:
+        seen: ``(members, B, guide_dim, H/7, W/7)`` what each member's last layers read.
+        doubt: ``(B, H/7, W/7)`` log spread common to the members; None where each has its own.
+    """
+
+    seen: Tensor
+    doubt: Tensor | None = None
+
+
+@dataclass(frozen=True)
 class LastLayerChange:
     """How log depth differs from what was trained.
 
@@ -66,18 +79,6 @@ class LastLayerChange:
 
     weights: Tensor
     offset: float = 0.0
-
-
-class HeadFeatures(NamedTuple):
-    """All that is needed to decode depth.
-
-    Attributes:
-        members: ``(members, B, guide_dim, H/7, W/7)``.
-        log_spread: ``(B, H/7, W/7)``; None where each member has its own.
-    """
-
-    members: Tensor
-    log_spread: Tensor | None
 
 
 class _Residual(nn.Module):
@@ -135,18 +136,16 @@ class DepthHead(nn.Module):
         coarse, features = self.coarse(tokens, class_tokens, image)
         return convex_upsample(coarse, self.weights(features))
 
-    def decode(
-        self, features: Tensor, change: Tensor | None = None, log_spread: Tensor | None = None
-    ) -> Tensor:
+    def decode(self, features: Tensor, doubt: Tensor | None = None, change: Tensor | None = None) -> Tensor:
         """What :meth:`forward` gives, from the features of :meth:`coarse`.
 
         Args:
+            doubt: ``(B, H/7, W/7)`` log spread to take instead of its own.
             change: ``(guide_dim,)`` weights for log depth; what they say is a third channel.
-            log_spread: ``(B, H/7, W/7)`` instead of the head's own.
         """
         coarse = self.out(features)
-        if log_spread is not None:
-            coarse = torch.stack([coarse[:, 0], log_spread], dim=1)
+        if doubt is not None:
+            coarse = torch.stack([coarse[:, 0], doubt], dim=1)
         if change is not None:
             coarse = torch.cat([coarse, torch.einsum("c,bchw->bhw", change, features)[:, None]], dim=1)
         return convex_upsample(coarse, self.weights(features))
@@ -191,20 +190,18 @@ class HeadEnsemble(nn.Module):
         return cast("Sequence[DepthHead]", self.members)
 
     def features(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> HeadFeatures:
-        """What the members' last layers read, and the doubt of what they say as trained."""
-        coarse = [member.coarse(tokens, class_tokens, image) for member in self._heads]
-        log_spread = None
-        if self.doubt is not None:
-            log_depth = torch.stack([both[:, 0] for both, _ in coarse]).mean(dim=0)
-            log_spread = self.doubt(tokens[:, -1], log_depth)
-        return HeadFeatures(torch.stack([seen for _, seen in coarse]), log_spread)
+        """What the members' last layers read, and the common doubt where there is one."""
+        seen = torch.stack([member.coarse(tokens, class_tokens, image)[1] for member in self._heads])
+        if self.doubt is None:
+            return HeadFeatures(seen)
+        return HeadFeatures(seen, self.doubt(tokens[:, -1], self.coarse_log_depth(seen)))
 
     def decode(self, features: HeadFeatures, change: LastLayerChange | None = None) -> tuple[Tensor, Tensor]:
         """What :meth:`forward` gives, from :meth:`features`."""
         changes = [None] * len(self.members) if change is None else change.weights
         outs = torch.stack([
-            member.decode(seen, own, features.log_spread)
-            for member, seen, own in zip(self._heads, features.members, changes, strict=True)
+            member.decode(seen, features.doubt, own)
+            for member, seen, own in zip(self._heads, features.seen, changes, strict=True)
         ])  # fmt: skip
         mean = outs[:, :, 0].mean(dim=0)
         if change is not None:
@@ -213,9 +210,9 @@ class HeadEnsemble(nn.Module):
         # A Laplace distribution of spread b has the variance 2 b^2.
         return mean, self.sigma_scale * math.sqrt(2.0) * outs[:, :, 1].mean(dim=0).exp()
 
-    def coarse_log_depth(self, features: HeadFeatures) -> Tensor:
+    def coarse_log_depth(self, seen: Tensor) -> Tensor:
         """Mean log depth ``(B, H/7, W/7)`` of the members before the upsampling."""
-        outs = [member.out(seen)[:, 0] for member, seen in zip(self._heads, features.members, strict=True)]
+        outs = [member.out(own)[:, 0] for member, own in zip(self._heads, seen, strict=True)]
         return torch.stack(outs).mean(dim=0)
 
 
