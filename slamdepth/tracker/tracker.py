@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,8 +13,7 @@ from slamdepth.depth.adaptation import adapting
 from slamdepth.depth.base import DepthModel
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.features import Features
-from slamdepth.frontend.rolling_shutter import velocity_between
-from slamdepth.geometry import invert, so3_exp, so3_log
+from slamdepth.geometry import invert
 from slamdepth.mapping.landmarks import LandmarkMap
 from slamdepth.tracker.adaptation import MapTeaching, in_words
 from slamdepth.tracker.checks import check_frame, model_for
@@ -28,6 +26,7 @@ from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Localiser, Placement
 from slamdepth.tracker.loop_closer import LoopCloser
 from slamdepth.tracker.map_adjuster import MapAdjuster
+from slamdepth.tracker.motion import Motion
 from slamdepth.tracker.prepare import Preparation, Prepared, load_libraries
 from slamdepth.tracker.rescue import CloudRescue
 from slamdepth.tracker.retry import Retry
@@ -50,7 +49,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_MAX_EXTRAPOLATION = 3.0  # frame intervals the constant velocity is believed for
 _RELOCALISATION_CANDIDATES = 4
 
 
@@ -106,10 +104,7 @@ class Tracker:
             self._watch,
             self._teaching,
         )
-        self._last: Placement | None = None
-        self._velocity = np.eye(4)  # T_camera(now)_camera(before)
-        self._last_time_s = -np.inf
-        self._last_step_s = 0.0
+        self._motion = Motion()
         self._frames = 0
         self._relocalisations = 0
         self._rescues = 0
@@ -135,11 +130,11 @@ class Tracker:
             TrackingError: the tracker has finished, or time does not increase.
             CameraError: the frame was taken by another camera.
         """
-        check_frame(frame, self.camera, self._last_time_s, self._finished)
+        check_frame(frame, self.camera, self._motion.last_time_s, self._finished)
         self._watch.next_frame()
         with one_blas_thread():
             result = self._step(frame, prepared or self.prepare(frame))
-        self._last_time_s = frame.timestamp_s
+        self._motion.last_time_s = frame.timestamp_s
         return result
 
     def _step(self, frame: Frame, prepared: Prepared) -> StepResult:
@@ -156,9 +151,9 @@ class Tracker:
             features = self._still(frame, plain)
             placement, status = self._place(frame, features)
             if placement is None:
-                if self._last is not None:
-                    self._retry.start(self._last.T_camera_world, self._velocity)
-                self._last = None
+                if self._motion.last is not None:
+                    self._retry.start(self._motion.last.T_camera_world, self._motion.step)
+                self._motion.last = None
                 return self._result(frame, TrackingStatus.LOST, None, False)
             features, placement = self._settle(frame, plain, features, placement)
         is_keyframe = self._keyframes.wants(placement) and self._depth.has_depth(frame)
@@ -169,44 +164,37 @@ class Tracker:
         if is_keyframe:
             before = placement
             placement = self._make_keyframe(frame, features, placement)
-            self._remember_motion(frame, before, placement)
+            self._motion.remember(frame.timestamp_s, before, placement)
         else:
-            self._remember_motion(frame, placement, placement)
+            self._motion.remember(frame.timestamp_s, placement, placement)
         self._log.add(frame.timestamp_s, plain, placement, is_keyframe)
         return self._result(frame, status, placement, is_keyframe)
 
     def _still(self, frame: Frame, plain: Features) -> Features:
         """Features freed from the rolling shutter by the velocity of the last frames."""
-        if not self._shutter.rolls or self._last is None:
+        if not self._shutter.rolls or self._motion.last is None:
             return plain
-        T_guess = self._predicted(frame, self._last)
-        near = np.full(len(plain), np.median(self._shutter.inverse_depth(T_guess, self._last.point_ids)))
-        return self._shutter.correct(plain, self._camera_velocity(frame, T_guess), near)
+        T_guess = self._motion.guess(frame.timestamp_s)
+        near = np.full(
+            len(plain), np.median(self._shutter.inverse_depth(T_guess, self._motion.last.point_ids))
+        )
+        return self._shutter.correct(plain, self._motion.velocity(frame.timestamp_s, T_guess), near)
 
     def _settle(
         self, frame: Frame, plain: Features, features: Features, placement: Placement
     ) -> tuple[Features, Placement]:
         """The same by the velocity of this very frame, and the frame placed by that."""
-        if not self._shutter.rolls or self._last is None:
+        if not self._shutter.rolls or self._motion.last is None:
             return features, placement
         T = placement.T_camera_world
         inverse = self._shutter.inverse_depth(T, placement.point_ids)
-        settled = self._shutter.correct(plain, self._camera_velocity(frame, T), inverse)
+        settled = self._shutter.correct(plain, self._motion.velocity(frame.timestamp_s, T), inverse)
         return settled, self._localiser.settle(settled, placement)
-
-    def _camera_velocity(self, frame: Frame, T_camera_world: Floats) -> Floats:
-        """``(6,)`` m/s and rad/s since the last frame."""
-        if self._last is None:
-            return np.zeros(6)
-        return velocity_between(
-            self._last.T_camera_world, T_camera_world, frame.timestamp_s - self._last_time_s
-        )
 
     def _join(self) -> Moved | None:
         """Let the waiting keyframe have its depth, and follow the map."""
         moved = self._keyframes.join()
-        if moved is not None and self._last is not None:
-            self._last = replace(self._last, T_camera_world=moved.carry(self._last.T_camera_world))
+        self._motion.follow(moved)
         return moved
 
     def _forget_points(self) -> None:
@@ -214,8 +202,7 @@ class Tracker:
         now = self._map.compact()
         if now is not None:
             self._log.renumber(now)
-            if self._last is not None:
-                self._last = replace(self._last, point_ids=now[self._last.point_ids])
+            self._motion.renumber(now)
 
     def _place_again(self, features: Features, placement: Placement) -> Placement:
         """Place a frame in the map that its keyframe's depth has just made larger."""
@@ -227,7 +214,7 @@ class Tracker:
             return self._localiser.refine_in_local_map(features, carried) or carried
 
     def _make_keyframe(self, frame: Frame, features: Features, placement: Placement) -> Placement:
-        velocity = self._camera_velocity(frame, placement.T_camera_world)
+        velocity = self._motion.velocity(frame.timestamp_s, placement.T_camera_world)
         keyframe = self._keyframes.make(frame, features, placement, velocity)
         if self._keyframes.is_due:
             self._keyframes.join()
@@ -241,7 +228,7 @@ class Tracker:
             return self._result(frame, TrackingStatus.INITIALISING, None, False)
         empty = Placement(np.eye(4), np.full(len(features), -1, dtype=np.int64))
         placement = self._make_keyframe(frame, features, empty)
-        self._remember_motion(frame, placement, placement)
+        self._motion.remember(frame.timestamp_s, placement, placement)
         self._log.add(frame.timestamp_s, features, placement, True)
         return self._result(frame, TrackingStatus.TRACKING, placement, True)
 
@@ -261,11 +248,11 @@ class Tracker:
         )
 
     def _place(self, frame: Frame, features: Features) -> tuple[Placement | None, TrackingStatus]:
-        if self._last is None:
+        if self._motion.last is None:
             self._retry.count_frame()
         else:
-            T_guess = self._predicted(frame, self._last)
-            rows = self._map.resolve(self._last.point_ids)
+            T_guess = self._motion.guess(frame.timestamp_s)
+            rows = self._map.resolve(self._motion.last.point_ids)
             placement = self._localiser.track(features, T_guess, np.unique(rows[rows >= 0]))
             if placement is not None:
                 return placement, TrackingStatus.TRACKING
@@ -281,7 +268,7 @@ class Tracker:
         if placement is not None:
             self._relocalisations += 1
             return placement, TrackingStatus.RELOCALISED
-        if self._last is None and self._retry.is_due(
+        if self._motion.last is None and self._retry.is_due(
             has_depth=self._depth.has_depth(frame),
             is_instant=self._depth.is_instant(frame),
             is_blank=len(features) == 0,
@@ -291,19 +278,10 @@ class Tracker:
                 return placement, TrackingStatus.RESCUED
         return None, TrackingStatus.LOST
 
-    def _predicted(self, frame: Frame, last: Placement) -> Floats:
-        """``T_camera_world`` at constant velocity."""
-        ratio = (frame.timestamp_s - self._last_time_s) / self._last_step_s if self._last_step_s > 0 else 1.0
-        ratio = min(ratio, _MAX_EXTRAPOLATION)
-        motion = np.eye(4)
-        motion[:3, :3] = so3_exp(so3_log(self._velocity[:3, :3]) * ratio)
-        motion[:3, 3] = self._velocity[:3, 3] * ratio
-        return motion @ last.T_camera_world
-
     def _relocalise(self, features: Features) -> Placement | None:
         answers = self._loops.places.query(features.place_descriptors, top_k=_RELOCALISATION_CANDIDATES)
         newest = len(self._map.keyframes) - 1
-        tried = newest if self._last is not None else -1
+        tried = newest if self._motion.last is not None else -1
         for k in dict.fromkeys([newest, *(k for k, _ in answers)]):
             if k == tried:
                 continue
@@ -337,15 +315,6 @@ class Tracker:
     def held(self) -> HeldBytes:
         """How much memory keyframes, points and frames take by now."""
         return held_bytes(self._map, self._log, self._keyframes.store)
-
-    def _remember_motion(self, frame: Frame, measured: Placement, final: Placement) -> None:
-        """Velocity from the pose as measured, so that a correction of the map is not taken for motion."""
-        if self._last is not None:
-            self._velocity = measured.T_camera_world @ invert(self._last.T_camera_world)
-            self._last_step_s = frame.timestamp_s - self._last_time_s
-        else:
-            self._velocity = np.eye(4)
-        self._last = final
 
     def finish(self) -> Reconstruction:
         """Adjust the whole map, make it metric, place every frame in it, and hand it over.
