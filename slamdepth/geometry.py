@@ -106,6 +106,11 @@ def se3_exp(xi: Array) -> Array:
     return T
 
 
+def se3_log(T: Array) -> Array:
+    """Tangents ``(..., 6)`` of rigid transforms ``(..., 4, 4)``; the inverse of :func:`se3_exp`."""
+    return np.concatenate([T[..., :3, 3], so3_log(T[..., :3, :3])], axis=-1)
+
+
 def rotation_angle_rad(R: Array) -> Array:
     """Angles ``(...)`` in radians of rotation matrices ``(..., 3, 3)``."""
     return np.linalg.norm(so3_log(R), axis=-1)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.geometry import so3_log
+from slamdepth.geometry import so3_log, transform
 from slamdepth.types import Camera
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
+_NEAREST_M = 0.05
 _STEP_S = 1e-3  # of the difference quotient; the motion is linear in it but for the perspective
 
 
@@ -46,6 +47,11 @@ def velocity_between(T_camera_world_a: Floats, T_camera_world_b: Floats, interva
     way_w = R_world_a @ T_camera_world_a[:3, 3] - R_world_b @ T_camera_world_b[:3, 3]
     way = 0.5 * (R_world_a.T + R_world_b.T) @ way_w
     return np.concatenate([way, turn]) / interval_s
+
+
+def inverse_depth(T_camera_world: Floats, points_w: Floats) -> Floats:
+    """``(N,)`` 1/m of points ``(N, 3)`` in a camera; what lies behind it is taken to be near."""
+    return np.asarray(1.0 / np.maximum(transform(T_camera_world, points_w)[:, 2], _NEAREST_M))
 
 
 def at_middle_row(

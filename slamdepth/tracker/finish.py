@@ -69,7 +69,7 @@ def _adjust_all(
 ) -> None:
     """Adjust everything, look again for what the better map predicts to be seen, and adjust once more."""
     every = [k.id for k in landmarks.keyframes]
-    _follow_motion(landmarks, frames, shutter)
+    _follow_motion(frames, shutter)
     adjuster.adjust(every, [], landmarks.seen_by(2), (5, 8))
     for n in range(_PASSES):
         before_s = shutter.readout_s
@@ -78,7 +78,7 @@ def _adjust_all(
         is_settled = abs(shutter.readout_s - before_s) < _SETTLED_S
         if n > 0 and is_settled:
             break
-        _follow_motion(landmarks, frames, shutter)
+        _follow_motion(frames, shutter)
         for keyframe in landmarks.keyframes:
             mapper.search_neighbours(keyframe, limit=_SEARCHED_AGAIN)
         adjuster.adjust(every, [], landmarks.seen_by(2), (5, 8))
@@ -86,12 +86,10 @@ def _adjust_all(
             break
 
 
-def _follow_motion(landmarks: LandmarkMap, frames: FrameLog, shutter: Shutter) -> None:
+def _follow_motion(frames: FrameLog, shutter: Shutter) -> None:
     """Correct all keyframes for the shutter by velocities of the whole trajectory."""
     frames.refresh_velocities()
-    if shutter.rolls:
-        for keyframe in landmarks.keyframes:
-            shutter.correct_keyframe(keyframe)
+    shutter.correct_keyframes()
 
 
 def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> tuple[float, ...]:
@@ -156,11 +154,10 @@ def build_reconstruction(
         if refine_frames:
             frames.refine(shutter.readout_s)
         keyframes = tuple(made.result() for made in making)
-    good = landmarks.alive[: landmarks.size] & (landmarks.observations[: landmarks.size] >= 2)
     return Reconstruction(
         trajectory=frames.trajectory(),
         keyframes=keyframes,
-        points_m=landmarks.position_w[: landmarks.size][good],
+        points_m=landmarks.position_w[landmarks.seen_by(2)],
         frames=frames_total,
         tracked=len(frames),
         loop_closures=loop_closures,

@@ -10,8 +10,8 @@ import numpy as np
 
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.pose import refine_pose
-from slamdepth.frontend.rolling_shutter import at_middle_row, row_phase, velocity_between
-from slamdepth.geometry import invert, transform
+from slamdepth.frontend.rolling_shutter import at_middle_row, inverse_depth, row_phase, velocity_between
+from slamdepth.geometry import invert
 from slamdepth.mapping.landmarks import LandmarkMap
 from slamdepth.tracker.localiser import Placement
 from slamdepth.types import Camera, Trajectory
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 _MIN_MATCHES = 30
 _MAX_GAP_S = 0.2  # frames farther apart say little of the velocity between them
-_NEAREST_M = 0.05
 _PRUNE_AT = 256  # frames, then always twice as many
 _MAX_SHIFT_SHARE = 0.1  # of the scene's distance: a refinement is no relocation
 
@@ -171,8 +170,7 @@ class FrameLog:
             start = self.T_camera_world(placed)
             px = placed.px[good].astype(np.float64)
             if readout_s:
-                z = transform(start, landmarks.position_w[rows])[:, 2]
-                inverse = 1.0 / np.maximum(z, _NEAREST_M)
+                inverse = inverse_depth(start, landmarks.position_w[rows])
                 phase = placed.phase[good].astype(np.float64)
                 px = at_middle_row(self._camera, px, phase, inverse, velocities[n], readout_s)
             estimate = refine_pose(

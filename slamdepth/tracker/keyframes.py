@@ -205,8 +205,8 @@ class Keyframes:
             self._mapper.search_neighbours(keyframe)
         with self._timed("bundle"):
             self._mapper.adjust_window(keyframe)
-            if self._shutter.is_due(len(self._map.keyframes)):
-                self._adjuster.find_readout()
+            if self._shutter.is_due(len(self._map.keyframes)) and self._adjuster.find_readout():
+                self._shutter.correct_keyframes()
         with self._timed("loops"):
             self._loops.add(keyframe)
             correction = self._loops.close(keyframe)

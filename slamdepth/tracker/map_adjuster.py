@@ -71,7 +71,7 @@ class MapAdjuster:
         it is no more than a supposition, the map must not depend on it.
 
         Returns:
-            Whether the readout time is another now; all keyframes then follow.
+            Whether the readout time is another now; keyframes have to follow.
         """
         if window is None:
             last = len(self._map.keyframes)
@@ -82,13 +82,8 @@ class MapAdjuster:
         if part is None:
             return False
         result = bundle_adjust(part.problem, (3, 3))
-        if result.readout_sigma_s is None or not self._shutter.learn(
-            result.readout_s, result.readout_sigma_s
-        ):
-            return False
-        for keyframe in self._map.keyframes:
-            self._shutter.correct_keyframe(keyframe)
-        return True
+        assert result.readout_sigma_s is not None
+        return self._shutter.learn(result.readout_s, result.readout_sigma_s)
 
     def _part(
         self, window: list[int], fixed: list[int], rows: Ints, *, find_readout: bool = False

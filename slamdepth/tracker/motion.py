@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.frontend.rolling_shutter import velocity_between
-from slamdepth.geometry import invert, so3_exp, so3_log
+from slamdepth.geometry import invert, se3_exp, se3_log
 from slamdepth.tracker.keyframes import Moved
 from slamdepth.tracker.localiser import Placement
 
@@ -42,10 +42,7 @@ class Motion:
         assert self.last is not None
         ratio = (timestamp_s - self.last_time_s) / self._step_s if self._step_s > 0 else 1.0
         ratio = min(ratio, _MAX_EXTRAPOLATION)
-        motion = np.eye(4)
-        motion[:3, :3] = so3_exp(so3_log(self.step[:3, :3]) * ratio)
-        motion[:3, 3] = self.step[:3, 3] * ratio
-        return motion @ self.last.T_camera_world
+        return se3_exp(se3_log(self.step) * ratio) @ self.last.T_camera_world
 
     def velocity(self, timestamp_s: float, T_camera_world: Floats) -> Floats:
         """``(6,)`` m/s and rad/s since the last frame of a camera that is at ``T_camera_world`` now."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.geometry import so3_exp, so3_log
+from slamdepth.geometry import se3_exp, se3_log
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,7 +35,7 @@ class Retry:
     def start(self, T_camera_world: Floats, velocity: Floats) -> None:
         """The camera was last at ``T_camera_world`` with ``velocity``, both ``(4, 4)``, a frame ago."""
         self._T_camera_world = T_camera_world
-        self._motion = np.concatenate([velocity[:3, 3], so3_log(velocity[:3, :3])])
+        self._motion = se3_log(velocity)
         self._lost, self._tried = 1, 1
 
     def count_frame(self) -> None:
@@ -64,7 +64,4 @@ class Retry:
         """``T_camera_world (4, 4)`` now, had the motion died away since."""
         assert self._T_camera_world is not None
         reach = sum(_DECAY**n for n in range(self._lost))
-        motion = np.eye(4)
-        motion[:3, 3] = self._motion[:3] * reach
-        motion[:3, :3] = so3_exp(self._motion[3:] * reach)
-        return motion @ self._T_camera_world
+        return se3_exp(self._motion * reach) @ self._T_camera_world

@@ -11,8 +11,7 @@ import numpy as np
 
 from slamdepth.config import ShutterConfig
 from slamdepth.frontend.features import Features
-from slamdepth.frontend.rolling_shutter import at_middle_row, px_per_readout_s, row_phase
-from slamdepth.geometry import transform
+from slamdepth.frontend.rolling_shutter import at_middle_row, inverse_depth, px_per_readout_s, row_phase
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.types import Camera
 
@@ -28,7 +27,6 @@ _FIRST_SEARCH = 10  # keyframes; sought again whenever there are half as many mo
 _SURE_S = 0.004  # a deviation beyond says nothing yet
 _SIGNIFICANT = 5.0  # deviations from nought; observations are less independent than they claim
 _ABSURD_S = 0.05
-_NEAREST_M = 0.05
 
 
 class Shutter:
@@ -71,8 +69,7 @@ class Shutter:
         at = np.flatnonzero(point_ids >= 0)
         if len(at) == 0:
             return out
-        z = transform(T_camera_world, self._map.position_w[point_ids[at]])[:, 2]
-        inverse = 1.0 / np.maximum(z, _NEAREST_M)
+        inverse = inverse_depth(T_camera_world, self._map.position_w[point_ids[at]])
         out[:] = np.median(inverse)
         out[at] = inverse
         return out
@@ -82,6 +79,12 @@ class Shutter:
         plain = self._plain(keyframe)
         inverse = self.inverse_depth(keyframe.T_camera_world, keyframe.point_ids)
         keyframe.features = self.correct(plain, keyframe.velocity, inverse)
+
+    def correct_keyframes(self) -> None:
+        """The same for all keyframes of the map; nothing where no shutter rolls."""
+        if self.rolls:
+            for keyframe in self._map.keyframes:
+                self.correct_keyframe(keyframe)
 
     def px_rate(self, keyframe: MapKeyframe, at: Ints) -> Floats:
         """Pixels ``(M, 2)`` a second of readout time moves the features ``at`` of a keyframe."""
