@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.markdown import markdown_table
 from benchmarks.ours import SlamDepth
 from benchmarks.summary import environment
 from slamdepth.config import Config
@@ -95,12 +96,11 @@ def score(dataset: Dataset, done: Reconstruction) -> dict[str, Any]:
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """The rows as Markdown."""
     heads = ["sequence", "`--adapt`", "keyframes", *COLUMNS.values()]
-    lines = ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
+    lines = []
     for row in rows:
-        cells = [row["sequence"], "on" if row["adapt"] else "off", str(row["keyframes"])]
-        cells += [_cell(row.get(name)) for name in COLUMNS]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        about = [row["sequence"], "on" if row["adapt"] else "off", str(row["keyframes"])]
+        lines.append([*about, *(_cell(row.get(name)) for name in COLUMNS)])
+    return markdown_table(heads, lines)
 
 
 def _cell(value: Any) -> str:

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from benchmarks.markdown import markdown_table
 from benchmarks.summary import environment
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.evaluate import judge_depth
@@ -83,13 +84,13 @@ def table(rows: Iterable[Mapping[str, Any]]) -> str:
     """Rows as Markdown; ± is half of the 95 % interval over frames."""
     headings = ["model", "judged on", "frames", *(name for name, *_ in _COLUMNS)]
     headings += ["scale spread", "surest half"]
-    lines = ["| " + " | ".join(headings) + " |", "| --- " * len(headings) + "|"]
+    lines = []
     for row in rows:
         cells = [_cell(row["ways"].get(way, {}).get(key), digits) for _, way, key, digits in _COLUMNS]
         more = [_cell(row["scale_spread"], 3), _cell(row["surest_half"], 2)]
         about = [row["model"], row["settings"]["data"], str(row["frames"])]
-        lines.append("| " + " | ".join([*about, *cells, *more]) + " |")
-    return "\n".join(lines)
+        lines.append([*about, *cells, *more])
+    return markdown_table(headings, lines)
 
 
 def mean_row(label: str, rows: list[Mapping[str, Any]]) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from typing import Any
 
 from rich.console import Console
 
+from benchmarks.markdown import markdown_table
 from benchmarks.summary import environment
 from benchmarks.worker import memory_mib
 from slamdepth.config import Config
@@ -121,11 +122,7 @@ def growth(samples: list[Sample], first_play: int) -> dict[str, float]:
 def table(samples: list[Sample]) -> str:
     """The samples as a table of a document."""
     heads = ("frames", "keyframes", "process MiB", "images", "features", "points", "seen", "on disk")
-    lines = [f"| {' | '.join(heads)} |", "| --- " * len(heads) + "|"]
-    for s in samples:
-        sizes = " | ".join(f"{size:.0f}" for size in list(asdict(s).values())[2:])
-        lines.append(f"| {s.frames} | {s.keyframes} | {sizes} |")
-    return "\n".join(lines)
+    return markdown_table(heads, [[f"{value:.0f}" for value in asdict(s).values()] for s in samples])
 
 
 def main(arguments: list[str]) -> int:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks import places_methods as methods
+from benchmarks.markdown import markdown_table
 from benchmarks.places_scores import score_answers
 from benchmarks.places_truth import labels, overlaps
 from benchmarks.slam import find_sequences, tell
@@ -185,13 +186,13 @@ def judge(
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows as Markdown."""
     headings = ["sequence", "method", "queries", "seen before", *(heading for heading, _, _ in _COLUMNS)]
-    lines = ["| " + " | ".join(headings) + " |", "| --- " * len(headings) + "|"]
+    lines = []
     for row in rows:
         figures = row["figures"]
         cells = [f"{figures[key]:.{digits}f}" for _, key, digits in _COLUMNS]
         counts = [str(figures["queries"]), str(figures["known"])]
-        lines.append("| " + " | ".join([row["sequence"], row["method"], *counts, *cells]) + " |")
-    return "\n".join(lines)
+        lines.append([row["sequence"], row["method"], *counts, *cells])
+    return markdown_table(headings, lines)
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.markdown import markdown_table
 from benchmarks.summary import METRICS, Metric
 
 if TYPE_CHECKING:
@@ -67,14 +68,12 @@ def markdown(benchmark: Mapping[str, Any]) -> str:
     parts = []
     for sequence, rows in by_sequence(benchmark["rows"]).items():
         shown = [metric for metric in METRICS if any(metric.key in row["figures"] for row in rows)]
-        lines = [f"### {sequence}", ""]
-        lines.append("| system | depth | " + " | ".join(metric.heading for metric in shown) + " |")
-        lines.append("| --- " * (2 + len(shown)) + "|")
+        lines = []
         for row in rows:
             label = row["label"] if row["status"] == "ok" else f"{row['label']}: {_trouble(row)}"
-            cells = [label, row["depth"], *(cell(metric, row["figures"]) for metric in shown)]
-            lines.append("| " + " | ".join(text.replace("|", "\\|") for text in cells) + " |")
-        parts.append("\n".join(lines))
+            lines.append([label, row["depth"], *(cell(metric, row["figures"]) for metric in shown)])
+        headings = ["system", "depth", *(metric.heading for metric in shown)]
+        parts.append(f"### {sequence}\n\n{markdown_table(headings, lines)}")
     return "\n\n".join(parts) + "\n"
 
 
