@@ -52,7 +52,7 @@ class TrackingConfig(_Section):
     keyframe_min_inliers: int = Field(100, ge=0, description="... or when fewer points agree")
     local_keyframes: int = Field(12, ge=2, description="keyframes whose points are searched for")
     depth_delay: int = Field(
-        5, ge=0, le=30, description="frames after a keyframe until its predicted depth joins the map"
+        10, ge=0, le=30, description="frames after a keyframe until its predicted depth joins the map"
     )
 
 

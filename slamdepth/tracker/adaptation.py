@@ -47,9 +47,8 @@ class MapTeaching:
         self._depth = depth
         self._taught: list[tuple[int, Future[Adaptation]]] = []  # keyframes there were, what it says
 
-    def keyframe_joined(self) -> None:
-        """Tell that the last keyframe has its depth and is adjusted."""
-        count = len(self._map.keyframes)
+    def keyframe_joined(self, count: int) -> None:
+        """Tell that ``count`` keyframes have their depth and are adjusted."""
         if count >= _FIRST and count % _EVERY == 0:
             self._taught.append((count, self._depth.adapt(self._views())))
 

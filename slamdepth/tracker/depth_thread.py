@@ -22,8 +22,8 @@ class DepthThread:
     def __init__(self, model: DepthModel) -> None:
         self._model = model
         self._pool = ThreadPoolExecutor(1, "slamdepth-depth", initializer=one_thread_here)
-        self._asked: tuple[Frame, Future[DepthPrediction]] | None = None
-        self._taken: Frame | None = None
+        self._asked: list[tuple[Frame, Future[DepthPrediction]]] = []
+        self._taken: tuple[Frame, DepthPrediction] | None = None
 
     def has_depth(self, frame: Frame) -> bool:
         """A sensor may have no depth for a frame; a network always has."""
@@ -31,20 +31,26 @@ class DepthThread:
 
     def is_instant(self, frame: Frame) -> bool:
         """Whether the depth of ``frame`` costs no wait: a sensor's, or one taken before."""
-        return self._model.name == "sensor" or self._taken is frame
+        return self._model.name == "sensor" or self._is_taken(frame)
+
+    def _is_taken(self, frame: Frame) -> bool:
+        return self._taken is not None and self._taken[0] is frame
 
     def ask(self, frame: Frame) -> None:
-        """Start the prediction for ``frame``, unless it was the last one asked for."""
-        if self._asked is None or self._asked[0] is not frame:
-            self._asked = (frame, self._pool.submit(self._model.predict, frame))
-            self._taken = None
+        """Start the prediction for ``frame``, after those asked for before; nothing where it was."""
+        if not self._is_taken(frame) and all(asked is not frame for asked, _ in self._asked):
+            self._asked.append((frame, self._pool.submit(self._model.predict, frame)))
 
     def take(self, frame: Frame) -> DepthPrediction:
-        """The prediction for ``frame``; waits for it."""
+        """The prediction for ``frame``; waits for it. The last one taken can be taken again."""
         self.ask(frame)
-        assert self._asked is not None
-        self._taken = frame
-        return self._asked[1].result()
+        for n, (asked, prediction) in enumerate(self._asked):
+            if asked is frame:
+                self._taken = (frame, prediction.result())
+                del self._asked[n]
+                break
+        assert self._taken is not None
+        return self._taken[1]
 
     def again(self, frame: Frame, *, as_trained: bool = False) -> DepthPrediction:
         """The prediction of a model that learns for a frame asked for long ago: with what it has learnt

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a frame becomes a keyframe, and what happens then: at once, and when its depth is there.
+"""What happens when a frame becomes a keyframe: at once, and when its depth is there.
 
 A network takes several frames' time for one depth map. So the keyframe joins the map at
 once with the points it already knows, its depth is predicted in a thread of its own, and
 a fixed number of frames later, or earlier where tracking needs it, new points are born
-and the window is adjusted. When that is depends on the frames alone and not on how fast
-the network was, so the trajectory is the same on every machine.
+and the window is adjusted. Meanwhile another frame may become a keyframe. When what
+happens depends on the frames alone and not on how fast the network was, so the trajectory
+is the same on every machine.
+
+What follows the depth is spread over three frames, so that none of them takes long.
 """
 
 from __future__ import annotations
@@ -17,12 +20,13 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
-from slamdepth.geometry import orthonormalised, rotation_angle_rad
+from slamdepth.geometry import orthonormalised
 from slamdepth.mapping.keyframe_store import KeyframeStore
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.adaptation import MapTeaching
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.frame_log import FrameLog
+from slamdepth.tracker.keyframe_rule import KeyframeRule
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Placement
 from slamdepth.tracker.loop_closer import LoopCloser
@@ -36,15 +40,16 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-_START_KEYFRAMES = 8  # until so many, most points are known by a predicted depth only
-_KNOWN_GROUND = 0.5  # of the points of a keyframe that three see, seen again
-_RESCUE_STEP_M, _RESCUE_TURN_RAD = 0.1, 0.15  # between keyframes without features
+_MOST_WAITING = 2  # keyframes; with three, points are missed that the oldest would have given birth to
+_WAITED_FOR = 4  # first keyframes whose depth is waited for: all that follows stands on their points
+_STAGES = 3
 
 
 @dataclass
 class _Waiting:
     keyframe: MapKeyframe
     frames_left: int
+    stages_done: int = 0
 
 
 @dataclass
@@ -64,7 +69,7 @@ class Moved:
 
 
 class Keyframes:
-    """Chooses keyframes and grows the map with them.
+    """Grows the map with keyframes.
 
     Args:
         watch: measures the stages.
@@ -97,61 +102,28 @@ class Keyframes:
         self._shutter = shutter
         self._timed = watch.timed
         self.store = KeyframeStore(config.map.keyframe_memory_mib)
-        self._reference: MapKeyframe | None = None  # an earlier keyframe that shows the same
         self._teaching = teaching
-        self._reference_overlap = 0.0
-        self._still = 0
-        self._seen_share = 1.0  # of what the last keyframe knew, when its own points were born
-        self._waiting: _Waiting | None = None
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether the last keyframe still waits for its depth."""
-        return self._waiting is not None
+        self._rule = KeyframeRule(config, landmarks)
+        self._waiting: list[_Waiting] = []  # oldest first
 
     def wants(self, placement: Placement) -> bool:
-        """The view has moved on when much of what the reference saw is seen no more.
+        """Whether a frame should become a keyframe; see :class:`KeyframeRule`."""
+        return self._rule.wants(placement)
 
-        The reference is the last keyframe, or on known ground an earlier one that shows the same:
-        going back and forth makes no new ones (after ORB-SLAM's reference keyframe).
-        """
-        reference = self._reference or self._map.keyframes[-1]
-        seen = np.zeros(self._map.size + 1, dtype=bool)
-        seen[placement.point_ids] = True
-        seen[-1] = False
-        self._still = still = int(np.count_nonzero(seen[reference.point_ids]))
-        self._reference_overlap = max(self._reference_overlap or still / self._seen_share, still)
-        tracking = self._config.tracking
-        if placement.inliers < tracking.min_inliers:
-            # rescued: worth a keyframe where there are features to go on with, or new surfaces
-            many = len(placement.point_ids) >= tracking.keyframe_min_inliers
-            return many or self._has_moved_on(placement, reference)
-        if self._reference_overlap < tracking.min_inliers:
-            return True  # the last keyframe saw too little to measure by
-        starting = len(self._map.keyframes) < _START_KEYFRAMES
-        enough = tracking.keyframe_overlap_start if starting else tracking.keyframe_overlap
-        if still < enough * self._reference_overlap:
-            return starting or not self._is_known_ground(placement)
-        return placement.inliers < tracking.keyframe_min_inliers and still < 0.9 * self._reference_overlap
+    @property
+    def is_full(self) -> bool:
+        """Whether one more keyframe has to wait until the oldest waiting one has joined."""
+        return len(self._waiting) >= _MOST_WAITING
 
-    def _is_known_ground(self, placement: Placement) -> bool:
-        """Whether an earlier keyframe shows what the frame sees; the best such one is the reference then."""
-        earlier = len(self._map.keyframes) - self._config.loops.min_gap
-        if earlier <= 0 or placement.inliers < self._config.tracking.keyframe_min_inliers:
-            return False
-        shared = self._map.shared_points(placement.point_ids)[:earlier]
-        best = self._map.keyframes[int(np.argmax(shared))]
-        rows = best.point_ids[best.point_ids >= 0]
-        known = int(np.count_nonzero(self._map.observations[rows] >= 3))
-        if shared[best.id] < _KNOWN_GROUND * known:
-            return False
-        self._reference, self._reference_overlap = best, float(shared[best.id])
-        return True
+    @property
+    def is_due(self) -> bool:
+        """Whether the oldest waiting keyframe's time has come."""
+        return bool(self._waiting) and self._waiting[0].frames_left <= 0
 
-    def _has_moved_on(self, placement: Placement, reference: MapKeyframe) -> bool:
-        D = placement.T_camera_world @ reference.T_world_camera
-        turned = float(rotation_angle_rad(D[:3, :3]))
-        return float(np.linalg.norm(D[:3, 3])) > _RESCUE_STEP_M or turned > _RESCUE_TURN_RAD
+    def count_frame(self) -> None:
+        """Tell that another frame has come."""
+        for waiting in self._waiting:
+            waiting.frames_left -= 1
 
     def make(self, frame: Frame, features: Features, placement: Placement, velocity: Floats) -> MapKeyframe:
         """Put a frame into the map; its depth follows ``tracking.depth_delay`` frames later."""
@@ -160,13 +132,61 @@ class Keyframes:
             keyframe = self._mapper.insert(
                 frame, features, placement.T_camera_world, placement.point_ids, velocity
             )
-        self._reference = None
-        self._reference_overlap, self._still, self._seen_share = 0.0, 0, 1.0
-        # the first few are waited for: all that follows stands on the points born there
-        at_once = self._depth.is_instant(frame) or len(self._map.keyframes) <= _START_KEYFRAMES
-        delay = 0 if at_once else self._config.tracking.depth_delay
-        self._waiting = _Waiting(keyframe, delay)
+        self._rule.keyframe_made()
+        is_early = len(self._map.keyframes) <= _WAITED_FOR
+        at_once = is_early or self._depth.is_instant(frame)
+        self._waiting.append(_Waiting(keyframe, 0 if at_once else self._config.tracking.depth_delay))
+        if is_early:
+            self.join()
         return keyframe
+
+    def join(self, *, keyframes: int | None = None, stages: int | None = None) -> Moved | None:
+        """Go on with the waiting keyframes, oldest first: by default until none waits.
+
+        Args:
+            keyframes: at most so many are finished.
+            stages: at most so many stages are done.
+
+        Returns:
+            How the map moved around the newest keyframe; None where no keyframe waits.
+        """
+        if not self._waiting:
+            return None
+        anchor = self._map.keyframes[-1]
+        moved = Moved(anchor, anchor.T_world_camera)
+        left = _STAGES * len(self._waiting) if stages is None else stages
+        kept = 0 if keyframes is None else len(self._waiting) - keyframes
+        while len(self._waiting) > kept and left > 0:
+            scales = self._next_stage(self._waiting[0])
+            if scales is not None:
+                moved.scale *= float(scales[anchor.id])
+            left -= 1
+        return moved
+
+    def _next_stage(self, waiting: _Waiting) -> Floats | None:
+        """One stage of what follows a keyframe's depth.
+
+        Returns:
+            ``(K,)`` what the metres of each keyframe were multiplied by, where a loop was closed.
+        """
+        waiting.stages_done += 1
+        if waiting.stages_done == 1:
+            self._give_birth(waiting.keyframe)
+        elif waiting.stages_done == 2:
+            self._adjust(waiting.keyframe)
+        else:
+            del self._waiting[0]
+            return self._close_loops(waiting.keyframe)
+        return None
+
+    def _give_birth(self, keyframe: MapKeyframe) -> None:
+        with self._timed("depth"):
+            prediction = self._depth.take(keyframe.frame)
+        with self._timed("mapping"):
+            self._follow_motion(keyframe)
+            self._mapper.give_birth(keyframe, prediction)
+            self._mapper.search_neighbours(keyframe)
+        self._rule.points_born()
 
     def _follow_motion(self, keyframe: MapKeyframe) -> None:
         """Use that the frames after the keyframe tell how it moved."""
@@ -176,43 +196,18 @@ class Keyframes:
         if self._shutter.rolls:
             self._shutter.correct_keyframe(keyframe)
 
-    @property
-    def is_due(self) -> bool:
-        """Whether the waiting keyframe's time has come."""
-        return self._waiting is not None and self._waiting.frames_left <= 0
-
-    def count_frame(self) -> None:
-        """Tell that another frame has come."""
-        if self._waiting is not None:
-            self._waiting.frames_left -= 1
-
-    def join(self) -> Moved | None:
-        """Give the waiting keyframe its depth: points are born, searched for and adjusted.
-
-        Returns:
-            How the map moved around it; None where no keyframe waits.
-        """
-        if self._waiting is None:
-            return None
-        keyframe = self._waiting.keyframe
-        self._waiting = None
-        moved = Moved(keyframe, keyframe.T_world_camera)
-        with self._timed("depth"):
-            prediction = self._depth.take(keyframe.frame)
-        with self._timed("mapping"):
-            self._follow_motion(keyframe)
-            self._mapper.give_birth(keyframe, prediction)
-            self._mapper.search_neighbours(keyframe)
+    def _adjust(self, keyframe: MapKeyframe) -> None:
         with self._timed("bundle"):
             self._mapper.adjust_window(keyframe)
-            if self._shutter.is_due(len(self._map.keyframes)) and self._adjuster.find_readout():
+            if self._shutter.is_due(keyframe.id + 1) and self._adjuster.find_readout():
                 self._shutter.correct_keyframes()
+
+    def _close_loops(self, keyframe: MapKeyframe) -> Floats | None:
         with self._timed("loops"):
             self._loops.add(keyframe)
             correction = self._loops.close(keyframe)
         if correction is not None:
             self._log.rescale(correction.scales)
-            moved.scale = float(correction.scales[keyframe.id])
             with self._timed("bundle"):
                 self._mapper.search_neighbours(keyframe)
                 self._mapper.adjust_window(keyframe)
@@ -221,8 +216,5 @@ class Keyframes:
             self.store.tidy(self._map.keyframes)
         if self._teaching is not None:
             with self._timed("teaching"):
-                self._teaching.keyframe_joined()
-        if self._reference_overlap > 0:
-            self._seen_share = max(self._still / self._reference_overlap, 0.1)
-        self._reference, self._reference_overlap = None, 0.0
-        return moved
+                self._teaching.keyframe_joined(keyframe.id + 1)
+        return None if correction is None else correction.scales

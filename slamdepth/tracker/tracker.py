@@ -145,7 +145,7 @@ class Tracker:
             return self._start(frame, plain)
         self._keyframes.count_frame()
         if self._keyframes.is_due:
-            self._join()
+            self._join(stages=1)
         self._forget_points()
         with self._watch.timed("tracking"):
             features = self._still(frame, plain)
@@ -157,8 +157,8 @@ class Tracker:
                 return self._result(frame, TrackingStatus.LOST, None, False)
             features, placement = self._settle(frame, plain, features, placement)
         is_keyframe = self._keyframes.wants(placement) and self._depth.has_depth(frame)
-        if is_keyframe and self._keyframes.is_waiting:
-            # the depth that is on its way comes first: one keyframe waits at a time
+        if is_keyframe and self._keyframes.is_full:
+            # the depth that is on its way longest comes first
             placement = self._place_again(features, placement)
             is_keyframe = self._keyframes.wants(placement)
         if is_keyframe:
@@ -191,9 +191,9 @@ class Tracker:
         settled = self._shutter.correct(plain, self._motion.velocity(frame.timestamp_s, T), inverse)
         return settled, self._localiser.settle(settled, placement)
 
-    def _join(self) -> Moved | None:
-        """Let the waiting keyframe have its depth, and follow the map."""
-        moved = self._keyframes.join()
+    def _join(self, *, keyframes: int | None = None, stages: int | None = None) -> Moved | None:
+        """Let waiting keyframes have their depth, see ``Keyframes.join``, and follow the map."""
+        moved = self._keyframes.join(keyframes=keyframes, stages=stages)
         self._motion.follow(moved)
         return moved
 
@@ -206,7 +206,7 @@ class Tracker:
 
     def _place_again(self, features: Features, placement: Placement) -> Placement:
         """Place a frame in the map that its keyframe's depth has just made larger."""
-        moved = self._join()
+        moved = self._join(keyframes=1)
         assert moved is not None
         rows = self._map.resolve(placement.point_ids)
         carried = Placement(moved.carry(placement.T_camera_world), rows)
@@ -216,8 +216,6 @@ class Tracker:
     def _make_keyframe(self, frame: Frame, features: Features, placement: Placement) -> Placement:
         velocity = self._motion.velocity(frame.timestamp_s, placement.T_camera_world)
         keyframe = self._keyframes.make(frame, features, placement, velocity)
-        if self._keyframes.is_due:
-            self._keyframes.join()
         return Placement(keyframe.T_camera_world.copy(), keyframe.point_ids.copy())
 
     def _start(self, frame: Frame, features: Features) -> StepResult:
