@@ -100,8 +100,9 @@ def test_steps_say_what_was_done(sensor_run: tuple[Run, Reconstruction]) -> None
         assert result.T_world_camera is not None
         assert result.inliers >= CONFIG.tracking.min_inliers
         assert result.timings_ms["features"] > 0
-        assert ("bundle" in result.timings_ms) == result.is_keyframe
+        assert "mapping" in result.timings_ms or not result.is_keyframe
     totals = [r.keyframes for r in run.results]
+    assert sum("bundle" in r.timings_ms for r in run.results) >= totals[-1] - 2
     assert totals == sorted(totals)
     online = np.stack([r.T_world_camera for r in run.results])
     assert np.linalg.norm(online[:, :3, 3] - walk()[1][:, :3, 3], axis=1).max() < 0.04

@@ -22,7 +22,13 @@ from slamdepth.tracker import adaptation, create_tracker
 from slamdepth.tracker.finish import _scale_vote
 from slamdepth.types import Adaptation, Reconstruction
 
-ADAPT = CONFIG.model_copy(update={"depth": CONFIG.depth.model_copy(update={"adapt": True})})
+ADAPT = CONFIG.model_copy(
+    update={
+        "depth": CONFIG.depth.model_copy(update={"adapt": True}),
+        # the walk is short: points have to be born early to be well known at its end
+        "tracking": CONFIG.tracking.model_copy(update={"depth_delay": 4}),
+    }
+)
 
 
 @pytest.fixture(autouse=True)
@@ -93,7 +99,8 @@ def test_the_scale_is_voted_on_by_the_model_as_trained() -> None:
 
 
 def test_what_is_not_in_use_leaves_the_run_as_it_was() -> None:
-    plain = Run(frames(change=colour_only), Learner())
+    alike = ADAPT.model_copy(update={"depth": CONFIG.depth})
+    plain = Run(frames(change=colour_only), Learner(), alike)
     unused = Run(frames(change=colour_only), Learner(in_use=False), ADAPT)
     one, other = plain.finish(), unused.finish()
     np.testing.assert_array_equal(one.trajectory.T_world_camera, other.trajectory.T_world_camera)

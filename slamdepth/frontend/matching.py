@@ -26,7 +26,7 @@ class PixelGrid:
         cell_px: edge of a cell.
     """
 
-    def __init__(self, px: Floats, cell_px: float = 16.0) -> None:
+    def __init__(self, px: Floats, cell_px: float = 8.0) -> None:
         self._px = px
         if len(px) == 0:
             return

@@ -50,7 +50,7 @@ class MapTeaching:
     def keyframe_joined(self, count: int) -> None:
         """Tell that ``count`` keyframes have their depth and are adjusted."""
         if count >= _FIRST and count % _EVERY == 0:
-            self._taught.append((count, self._depth.adapt(self._views())))
+            self._taught.append((count, self._depth.adapt(self._views(count))))
 
     def set_back(self) -> None:
         """Give all keyframes the predictions of the model as trained, once the last has joined.
@@ -66,7 +66,7 @@ class MapTeaching:
 
     def finish(self) -> Adaptation:
         """Learn from the finished map."""
-        learnt = self._depth.adapt(self._views()).result()
+        learnt = self._depth.adapt(self._views(len(self._map.keyframes))).result()
         log.debug("learning from the map: %s", [*(taught.result() for _, taught in self._taught), learnt])
         return learnt
 
@@ -77,8 +77,8 @@ class MapTeaching:
         keyframes = [replace(k, prediction=self._depth.again(k.frame)) for k in made.keyframes]
         return replace(made, keyframes=tuple(keyframes))
 
-    def _views(self) -> list[TaughtView]:
-        return [self._view(keyframe) for keyframe in self._map.keyframes]
+    def _views(self, count: int) -> list[TaughtView]:
+        return [self._view(keyframe) for keyframe in self._map.keyframes[:count]]
 
     def _view(self, keyframe: MapKeyframe) -> TaughtView:
         at = np.flatnonzero(keyframe.point_ids >= 0)
