@@ -18,6 +18,7 @@ from slamdepth.mapping.landmarks import LandmarkMap
 from slamdepth.tracker.adaptation import MapTeaching, in_words
 from slamdepth.tracker.checks import check_frame, model_for
 from slamdepth.tracker.depth_thread import DepthThread
+from slamdepth.tracker.finder import Finder
 from slamdepth.tracker.finish import build_reconstruction, optimise_everything
 from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.held import HeldBytes, held_bytes
@@ -29,7 +30,6 @@ from slamdepth.tracker.map_adjuster import MapAdjuster
 from slamdepth.tracker.motion import Motion
 from slamdepth.tracker.prepare import Preparation, Prepared, load_libraries
 from slamdepth.tracker.rescue import CloudRescue
-from slamdepth.tracker.retry import Retry
 from slamdepth.tracker.shutter import Shutter
 from slamdepth.tracker.stopwatch import Stopwatch
 from slamdepth.tracker.threads import one_blas_thread
@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
-
-_RELOCALISATION_CANDIDATES = 4
 
 
 class Tracker:
@@ -87,8 +85,6 @@ class Tracker:
         self._adjuster = MapAdjuster(camera, self.config, self._map, self._shutter)
         self._mapper = LocalMapper(camera, self.config, self._map, self._localiser, self._adjuster)
         self._loops = LoopCloser(self.config, self._map, self._localiser)
-        self._rescue = CloudRescue(camera, self.config, self._map)
-        self._retry = Retry()
         self._log = FrameLog(camera, self._map)
         adapt = self.config.depth.adapt
         self._teaching = MapTeaching(self._map, self._mapper, self._depth) if adapt else None
@@ -105,9 +101,18 @@ class Tracker:
             self._teaching,
         )
         self._motion = Motion()
+        self._finder = Finder(
+            self.config,
+            self._map,
+            self._localiser,
+            self._loops.places,
+            CloudRescue(camera, self.config, self._map),
+            self._depth,
+            self._motion,
+            self._join,
+            self._depth_of,
+        )
         self._frames = 0
-        self._relocalisations = 0
-        self._rescues = 0
         self._finished = False
         load_libraries()
 
@@ -149,11 +154,8 @@ class Tracker:
         self._forget_points()
         with self._watch.timed("tracking"):
             features = self._still(frame, plain)
-            placement, status = self._place(frame, features)
+            placement, status = self._finder.place(frame, features)
             if placement is None:
-                if self._motion.last is not None:
-                    self._retry.start(self._motion.last.T_camera_world, self._motion.step)
-                self._motion.last = None
                 return self._result(frame, TrackingStatus.LOST, None, False)
             features, placement = self._settle(frame, plain, features, placement)
         is_keyframe = self._keyframes.wants(placement) and self._depth.has_depth(frame)
@@ -245,67 +247,6 @@ class Tracker:
             timings_ms=self._watch.frame_ms,
         )
 
-    def _place(self, frame: Frame, features: Features) -> tuple[Placement | None, TrackingStatus]:
-        if self._motion.last is None:
-            self._retry.count_frame()
-        else:
-            T_guess = self._motion.guess(frame.timestamp_s)
-            rows = self._map.resolve(self._motion.last.point_ids)
-            placement = self._localiser.track(features, T_guess, np.unique(rows[rows >= 0]))
-            if placement is not None:
-                return placement, TrackingStatus.TRACKING
-            if self._join() is not None:
-                return self._place(frame, features)
-            placement = self._localiser.from_keyframe(features, len(self._map.keyframes) - 1)
-            if placement is not None:
-                return placement, TrackingStatus.TRACKING
-            placement = self._register(frame, features, T_guess)
-            if placement is not None:
-                return placement, TrackingStatus.RESCUED
-        placement = self._relocalise(features)
-        if placement is not None:
-            self._relocalisations += 1
-            return placement, TrackingStatus.RELOCALISED
-        if self._motion.last is None and self._retry.is_due(
-            has_depth=self._depth.has_depth(frame),
-            is_instant=self._depth.is_instant(frame),
-            is_blank=len(features) == 0,
-        ):
-            placement = self._register(frame, features, self._retry.guess(), is_old=True)
-            if placement is not None:
-                return placement, TrackingStatus.RESCUED
-        return None, TrackingStatus.LOST
-
-    def _relocalise(self, features: Features) -> Placement | None:
-        answers = self._loops.places.query(features.place_descriptors, top_k=_RELOCALISATION_CANDIDATES)
-        newest = len(self._map.keyframes) - 1
-        tried = newest if self._motion.last is not None else -1
-        for k in dict.fromkeys([newest, *(k for k, _ in answers)]):
-            if k == tried:
-                continue
-            placement = self._localiser.from_keyframe(
-                features, k, minimum=self.config.loops.min_inliers if k != newest else None
-            )
-            if placement is not None:
-                return placement
-        return None
-
-    def _register(
-        self, frame: Frame, features: Features, T_guess: Floats, *, is_old: bool = False
-    ) -> Placement | None:
-        if not self._depth.has_depth(frame):
-            return None
-        T = self._rescue.place(self._depth_of(frame), T_guess, is_old=is_old)
-        if T is None:
-            return None
-        self._rescues += 1
-        log.info("frame %d: too few features match; placed by registration of its depth", frame.index)
-        empty = Placement(T, np.full(len(features), -1, dtype=np.int64))
-        recent = self._map.points_of(
-            [k.id for k in self._map.keyframes[-self.config.tracking.local_keyframes :]]
-        )
-        return self._localiser.attach(features, empty, recent)
-
     def _depth_of(self, frame: Frame) -> DepthPrediction:
         with self._watch.timed("depth"):
             return self._depth.take(frame)
@@ -344,8 +285,8 @@ class Tracker:
                 refine_frames=self.config.bundle.final,
                 frames_total=self._frames,
                 loop_closures=self._loops.count,
-                relocalisations=self._relocalisations,
-                rescues=self._rescues,
+                relocalisations=self._finder.relocalisations,
+                rescues=self._finder.rescues,
                 timings_ms=self._watch.mean_ms(),
                 notes=notes,
                 scale_votes=votes,
