@@ -81,7 +81,7 @@ def _adjust_all(
         _follow_motion(frames, shutter)
         for keyframe in landmarks.keyframes:
             mapper.search_neighbours(keyframe, limit=_SEARCHED_AGAIN)
-        adjuster.adjust(every, [], landmarks.seen_by(2), (5, 8))
+        adjuster.adjust(every, [], landmarks.seen_by(2), (3, 3))
         if is_settled:
             break
 

@@ -181,7 +181,7 @@ class FrameLog:
                 px,
                 placed.sigma_px[good].astype(np.float64),
                 rounds=2,
-                iterations=3,
+                iterations=2,
             )
             if np.count_nonzero(estimate.inliers) < 0.5 * len(good):
                 continue
