@@ -18,6 +18,7 @@ from slamdepth.depth.sensor import SensorDepth
 from slamdepth.frontend.rolling_shutter import at_middle_row, px_per_readout_s, row_phase, velocity_between
 from slamdepth.geometry import backproject, invert, project, se3_exp, so3_exp, transform
 from slamdepth.mapping.landmarks import LandmarkMap
+from slamdepth.tracker import create_tracker
 from slamdepth.tracker.shutter import Shutter
 from slamdepth.types import Camera, Frame, Reconstruction
 
@@ -83,6 +84,12 @@ def test_upper_rows_come_first_and_the_middle_row_stays() -> None:
     assert back[2, 0] > px[2, 0]
 
 
+def test_the_rows_of_an_upright_image_are_its_columns() -> None:
+    upright = Camera(480, 640, 510.0, 520.0, 241.0, 319.0)
+    px = np.array([[0.0, 600.0], [240.0, 10.0], [480.0, 320.0]])
+    np.testing.assert_allclose(row_phase(px, upright), [-0.5, 0.0, 0.5])
+
+
 @given(velocities, st.floats(0.01, 0.1))
 @settings(max_examples=50, deadline=None)
 def test_velocity_between_two_poses_is_the_velocity_that_leads_there(
@@ -134,6 +141,22 @@ def tracked(frames: list[Frame], config: Config = CONFIG) -> Reconstruction:
     return Run(frames, SensorDepth(), config).finish()
 
 
+def upright(frame: Frame) -> Frame:
+    """The same taken by the camera held upright, turned a quarter to the left."""
+    camera = replace(
+        CAMERA,
+        width=CAMERA.height,
+        height=CAMERA.width,
+        fx=CAMERA.fy,
+        fy=CAMERA.fx,
+        cx=CAMERA.cy,
+        cy=CAMERA.width - 1 - CAMERA.cx,
+    )
+    assert frame.depth_m is not None
+    image, depth = (np.ascontiguousarray(np.rot90(array)) for array in (frame.image_rgb, frame.depth_m))
+    return replace(frame, image_rgb=image, depth_m=depth, camera=camera)
+
+
 _SHAKE_RAD, _SHAKE_HZ = np.radians(2.5), 1.7
 
 
@@ -172,6 +195,17 @@ def test_the_readout_time_is_found_and_the_trajectory_better_for_it(rolling_fram
     assert ignored.readout_s == 0.0
     assert ignored.readout_sigma_s is None
     assert ate_m(found.trajectory) < 0.5 * ate_m(ignored.trajectory)
+
+
+def test_a_phone_held_upright_rolls_along_the_width(rolling_frames: list[Frame]) -> None:
+    turned = [upright(frame) for frame in rolling_frames]
+    tracker = create_tracker(turned[0].camera, SensorDepth(), CONFIG)
+    for frame in turned:
+        tracker.step(frame)
+    found = tracker.finish()
+    assert 0.6 * READOUT_S < (found.readout_s or 0.0) < 1.1 * READOUT_S
+    # the camera turned, its path did not
+    assert ate_m(found.trajectory) < 2.0 * ate_m(tracked(rolling_frames).trajectory)
 
 
 def test_a_global_shutter_is_recognised() -> None:

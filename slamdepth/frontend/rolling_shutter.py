@@ -28,8 +28,12 @@ _STEP_S = 1e-3  # of the difference quotient; the motion is linear in it but for
 
 
 def row_phase(raw_px: Floats, camera: Camera) -> Floats:
-    """When pixels ``(N, 2)`` of the image as taken are read, ``(N,)``: -0.5 the first row, 0.5 the last."""
-    return np.asarray(raw_px[:, 1] / camera.height - 0.5, dtype=np.float64)
+    """When pixels ``(N, 2)`` of the image as taken are read, ``(N,)``: -0.5 the first row, 0.5 the last.
+
+    A sensor's rows run along its longer side. So those of an upright image, of a phone say, are its columns.
+    """
+    axis, rows = (1, camera.height) if camera.width >= camera.height else (0, camera.width)
+    return np.asarray(raw_px[:, axis] / rows - 0.5, dtype=np.float64)
 
 
 def velocity_between(T_camera_world_a: Floats, T_camera_world_b: Floats, interval_s: float) -> Floats:
