@@ -103,10 +103,12 @@ def test_it_starts_as_what_it_was() -> None:
     assert equal(learner.predict(frame(0)), model().predict(frame(0)))
 
 
-def test_a_common_doubt_stays_what_it_was() -> None:
+@pytest.mark.parametrize("level_dim", [0, 4])
+def test_a_common_doubt_and_the_level_stay_what_they_were(level_dim: int) -> None:
     torch.manual_seed(0)
     backbone = DinoV2(dim=24, depth=2, heads=3, grid=5).eval().requires_grad_(False)
-    head = HeadEnsemble(HeadShape((0, 1), 24, 16, 1, 8, members=2, doubt=4)).eval().requires_grad_(False)
+    shape = HeadShape((0, 1), 24, 16, 1, 8, members=2, doubt=4, level_dim=level_dim)
+    head = HeadEnsemble(shape).eval().requires_grad_(False)
     doubting = Dinov2Depth(backbone, head, ())
     learner = adapting(doubting)
     first = doubting.predict(frame(0))

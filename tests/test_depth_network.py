@@ -20,10 +20,10 @@ from slamdepth.depth.head import (
     DepthHead,
     HeadEnsemble,
     HeadShape,
-    convex_upsample,
     load_head,
     save_head,
 )
+from slamdepth.depth.head_layers import convex_upsample
 from slamdepth.depth.layout import check_layout, dinov2_layout, pack_about
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, INPUT_AREA, focal_factor, input_size
 from slamdepth.errors import WeightsError
@@ -207,11 +207,48 @@ def test_a_doubt_says_how_sure_all_members_are_and_comes_back_from_the_file(tmp_
     torch.testing.assert_close(sigma, torch.full_like(sigma, 2.0 * 2.0**0.5 * 0.5), rtol=2e-3, atol=0)
 
 
-def test_a_head_of_the_first_format_is_read(tmp_path: Path) -> None:
+def level_and_relief(head: DepthHead, tokens: torch.Tensor, cls: torch.Tensor) -> tuple[float, torch.Tensor]:
+    with torch.inference_mode():
+        log_depth = head.coarse(tokens, cls, torch.zeros(1, 3, 42, 56))[0][0, 0]
+    return float(log_depth.mean()), log_depth - log_depth.mean()
+
+
+def test_a_level_told_apart_reads_what_is_common_to_a_view_and_its_relief_does_not() -> None:
+    torch.manual_seed(4)
+    head = DepthHead(replace(SMALL, level_dim=4)).eval()
+    tokens, cls, common = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 2, 24, 1, 1)
+    level, relief = level_and_relief(head, tokens, cls)
+    assert level == pytest.approx(math.log(1.8), abs=1e-5)  # as it starts
+    torch.nn.init.normal_(head.level.out.weight)
+    told = [level_and_relief(head, *args) for args in ((tokens + common, cls), (tokens, cls + 1))]
+    for other_level, same_relief in told:
+        assert abs(other_level - level) > 0.01
+        torch.testing.assert_close(same_relief, relief, atol=1e-5, rtol=1e-4)
+
+
+def test_levels_are_averaged_too_and_come_back_from_the_file(tmp_path: Path) -> None:
+    torch.manual_seed(5)
+    model = HeadEnsemble(replace(SMALL, level_dim=4, doubt=4))
+    for member, depth_m in zip(model.members, (1.0, 4.0), strict=True):
+        torch.nn.init.constant_(member.level.out.bias, math.log(depth_m))
+    save_head(tmp_path / "h.safetensors", model, {})
+    loaded, _ = load_head(tmp_path / "h.safetensors")
+    args = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56)
+    with torch.inference_mode():
+        features = loaded.features(*args)
+        coarse = loaded.coarse_log_depth(features)
+        outs = [member(*args) for member in loaded.members]
+        log_depth, _ = loaded.decode(features)
+    assert float(coarse.mean()) == pytest.approx(math.log(2.0), abs=1e-3)
+    torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
+
+
+@pytest.mark.parametrize(("number", "without"), [(1, {"doubt", "level_dim"}), (2, {"level_dim"})])
+def test_heads_of_earlier_formats_are_read(tmp_path: Path, number: int, without: set[str]) -> None:
     model = HeadEnsemble(SMALL)
     tensors = {name: value.half().contiguous() for name, value in model.state_dict().items()}
-    shape = {name: value for name, value in asdict(SMALL).items() if name != "doubt"}
-    about = {"format": "slamdepth-depth-head-1", "shape": json.dumps(shape), "sigma_scale": "1.5"}
+    shape = {name: value for name, value in asdict(SMALL).items() if name not in without}
+    about = {"format": f"slamdepth-depth-head-{number}", "shape": json.dumps(shape), "sigma_scale": "1.5"}
     save_file(tensors, tmp_path / "old.safetensors", metadata=pack_about(about))
     loaded, _ = load_head(tmp_path / "old.safetensors")
     assert loaded.doubt is None

@@ -40,11 +40,13 @@ _REWEIGHTINGS = 3
 
 @dataclass(frozen=True)
 class _Kept:
-    """Of one view: features ``(members, 1, C, h, w)`` in half precision, the members' common doubt, mean and
-    variance of the features over the image ``(members * C,)``, log depth ``(h, w)`` as trained."""
+    """Of one view: features ``(members, 1, C, h, w)`` in half precision, the members' common doubt, their
+    levels ``(members, 1)``, mean and variance of the features over the image ``(members * C,)``, log depth
+    ``(h, w)`` as trained."""
 
     features: Tensor
     doubt: Tensor | None
+    level: Tensor | None
     mean: Tensor
     variance: Tensor
     log_depth: Tensor
@@ -95,7 +97,7 @@ class AdaptingDinov2:
     def _features(self, frame: Frame) -> HeadFeatures:
         kept = self._kept.get(frame.index)
         if kept is not None:
-            return HeadFeatures(kept.features.float(), kept.doubt)
+            return HeadFeatures(kept.features.float(), kept.doubt, kept.level)
         features = self._model.features(frame)
         self._keep(frame.index, features)
         return features
@@ -126,6 +128,7 @@ class AdaptingDinov2:
         self._kept[index] = _Kept(
             features.seen.half(),
             features.doubt,
+            features.level,
             flat.mean(dim=1),
             flat.var(dim=1, correction=0),
             self._model.coarse_log_depth(features),

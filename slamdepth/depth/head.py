@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -21,15 +21,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from slamdepth.depth.doubt import Doubt
+from slamdepth.depth.head_layers import FACTOR, USUAL_DEPTH_M, Level, Residual, convex_upsample
 from slamdepth.depth.layout import check_layout, pack_about, unpack_about
 from slamdepth.errors import WeightsError
 
-_FACTOR = 7
 UPSAMPLING = "weights."
 """Prefix of the parameters that only the upsampling to full resolution uses."""
-FORMAT = "slamdepth-depth-head-2"
-_READABLE = ("slamdepth-depth-head-1", FORMAT)
-"""The first format had no ``doubt``."""
+FORMAT = "slamdepth-depth-head-3"
+_READABLE = ("slamdepth-depth-head-1", "slamdepth-depth-head-2", FORMAT)
+"""The first format had no ``doubt``, the second no ``level_dim``."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ class HeadShape:
         members: heads whose predictions are averaged.
         doubt: components of the tokens read by :class:`~slamdepth.depth.doubt.Doubt`, which then
             says how sure they are; 0 where the members themselves do.
+        level_dim: channels of the branch that tells a view's mean log depth apart from its relief;
+            0 where one branch tells both.
     """
 
     taps: tuple[int, ...] = (5, 8, 11)
@@ -52,6 +54,7 @@ class HeadShape:
     guide_dim: int = 64
     members: int = 1
     doubt: int = 0
+    level_dim: int = 0
 
 
 @dataclass(frozen=True)
@@ -61,10 +64,12 @@ class HeadFeatures:
     Attributes:
         seen: ``(members, B, guide_dim, H/7, W/7)`` what each member's last layers read.
         doubt: ``(B, H/7, W/7)`` log spread common to the members; None where each has its own.
+        level: ``(members, B)`` mean log depth of a view; None where the last layers tell it.
     """
 
     seen: Tensor
     doubt: Tensor | None = None
+    level: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -81,50 +86,59 @@ class LastLayerChange:
     offset: float = 0.0
 
 
-class _Residual(nn.Module):
-    """Depthwise 5 x 5, then two pointwise convolutions, as in ConvNeXt (Liu et al. 2022)."""
-
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.spread = nn.Conv2d(dim, dim, 5, padding=2, groups=dim)
-        self.norm = nn.GroupNorm(1, dim)
-        self.conv1 = nn.Conv2d(dim, 2 * dim, 1)
-        self.conv2 = nn.Conv2d(2 * dim, dim, 1)
-        nn.init.zeros_(self.conv2.weight)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.conv2(F.gelu(self.conv1(self.norm(self.spread(x)))))
-
-
 class DepthHead(nn.Module):
-    """One head. ``dropout`` works in training only."""
+    """One head. ``dropout`` works in training only.
+
+    With ``level_dim`` relief and level are told apart: relief, of mean 0, by tokens less their mean
+    over the view, so that it cannot know a place by what is common to its tokens; the level by those
+    means and the class tokens.
+    """
 
     def __init__(self, shape: HeadShape, dropout: float = 0.0) -> None:
         super().__init__()
         width = len(shape.taps) * shape.token_dim
         self.drop = nn.Dropout2d(dropout)
         self.tokens = nn.Conv2d(width, shape.dim, 1)
-        self.class_tokens = nn.Linear(width, shape.dim)
-        self.blocks = nn.ModuleList(_Residual(shape.dim) for _ in range(shape.blocks))
+        self.level = Level(width, shape.level_dim) if shape.level_dim else None
+        self.class_tokens = None if shape.level_dim else nn.Linear(width, shape.dim)
+        self.blocks = nn.ModuleList(Residual(shape.dim) for _ in range(shape.blocks))
         self.narrow = nn.Conv2d(shape.dim, shape.guide_dim, 1)
-        self.guide = nn.Conv2d(3 * _FACTOR * _FACTOR, shape.guide_dim, 1)
-        self.mix = _Residual(shape.guide_dim)
+        self.guide = nn.Conv2d(3 * FACTOR * FACTOR, shape.guide_dim, 1)
+        self.mix = Residual(shape.guide_dim)
         self.out = nn.Conv2d(shape.guide_dim, 2, 1)
-        self.weights = nn.Conv2d(shape.guide_dim, 9 * _FACTOR * _FACTOR, 1)
+        self.weights = nn.Conv2d(shape.guide_dim, 9 * FACTOR * FACTOR, 1)
         nn.init.normal_(self.out.weight, std=1e-3)
-        self.out.bias = nn.Parameter(torch.tensor([math.log(1.8), math.log(0.3)]))
+        self.out.bias = nn.Parameter(torch.tensor([math.log(USUAL_DEPTH_M), math.log(0.3)]))
 
-    def coarse(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Log depth and log spread ``(B, 2, H/7, W/7)``, and what the upsampling needs."""
-        batch, taps, dim, rows, columns = tokens.shape
-        x = self.tokens(self.drop(tokens.reshape(batch, taps * dim, rows, columns)))
-        cls = self.drop(class_tokens.reshape(batch, taps * dim, 1, 1))[..., 0, 0]
-        x = F.gelu(x + self.class_tokens(cls)[..., None, None])
+    def see(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What the last layers read ``(B, guide_dim, H/7, W/7)``, and the level ``(B,)`` if told apart."""
+        x, cls = tokens.flatten(1, 2), class_tokens.flatten(1)
+        level = None
+        if self.level is not None:
+            mean = x.mean(dim=(2, 3))
+            level = self.level(cls, mean)
+            x = x - mean[..., None, None]
+        x = self.tokens(self.drop(x))
+        if self.class_tokens is not None:
+            x = x + self.class_tokens(self.drop(cls[..., None, None])[..., 0, 0])[..., None, None]
+        x = F.gelu(x)
         for block in self.blocks:
             x = block(x)
         x = F.interpolate(self.narrow(x), scale_factor=2, mode="bilinear", align_corners=False)
-        x = self.mix(F.gelu(x + self.guide(F.pixel_unshuffle(image, _FACTOR))))
-        return self.out(x), x
+        return self.mix(F.gelu(x + self.guide(F.pixel_unshuffle(image, FACTOR)))), level
+
+    def tell(self, seen: Tensor, level: Tensor | None) -> Tensor:
+        """Log depth and log spread ``(B, 2, H/7, W/7)`` from what :meth:`see` gives."""
+        out: Tensor = self.out(seen)
+        if level is None:
+            return out
+        log_depth = out[:, :1] - out[:, :1].mean(dim=(2, 3), keepdim=True) + level[:, None, None, None]
+        return torch.cat([log_depth, out[:, 1:]], dim=1)
+
+    def coarse(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Log depth and log spread ``(B, 2, H/7, W/7)``, and what the upsampling needs."""
+        seen, level = self.see(tokens, class_tokens, image)
+        return self.tell(seen, level), seen
 
     def forward(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> Tensor:
         """Predict from ``tokens (B, taps, dim, H/14, W/14)``, ``class_tokens (B, taps, dim)``
@@ -136,30 +150,25 @@ class DepthHead(nn.Module):
         coarse, features = self.coarse(tokens, class_tokens, image)
         return convex_upsample(coarse, self.weights(features))
 
-    def decode(self, features: Tensor, doubt: Tensor | None = None, change: Tensor | None = None) -> Tensor:
-        """What :meth:`forward` gives, from the features of :meth:`coarse`.
+    def decode(
+        self,
+        seen: Tensor,
+        level: Tensor | None,
+        doubt: Tensor | None = None,
+        change: Tensor | None = None,
+    ) -> Tensor:
+        """What :meth:`forward` gives, from what :meth:`see` gives.
 
         Args:
             doubt: ``(B, H/7, W/7)`` log spread to take instead of its own.
             change: ``(guide_dim,)`` weights for log depth; what they say is a third channel.
         """
-        coarse = self.out(features)
+        coarse = self.tell(seen, level)
         if doubt is not None:
             coarse = torch.stack([coarse[:, 0], doubt], dim=1)
         if change is not None:
-            coarse = torch.cat([coarse, torch.einsum("c,bchw->bhw", change, features)[:, None]], dim=1)
-        return convex_upsample(coarse, self.weights(features))
-
-
-def convex_upsample(coarse: Tensor, logits: Tensor) -> Tensor:
-    """``coarse (B, C, h, w)`` at 7 times the size; ``logits (B, 9 * 49, h, w)`` choose among
-    each pixel's 3 x 3 coarse neighbours."""
-    batch, channels, rows, columns = coarse.shape
-    weights = logits.reshape(batch, 1, 9, _FACTOR * _FACTOR, rows * columns).softmax(dim=2)
-    padded = F.pad(coarse, (1, 1, 1, 1), mode="replicate")
-    neighbours = F.unfold(padded, 3).reshape(batch, channels, 9, 1, rows * columns)
-    fine = (weights * neighbours).sum(dim=2)
-    return F.pixel_shuffle(fine.reshape(batch, channels * _FACTOR * _FACTOR, rows, columns), _FACTOR)
+            coarse = torch.cat([coarse, torch.einsum("c,bchw->bhw", change, seen)[:, None]], dim=1)
+        return convex_upsample(coarse, self.weights(seen))
 
 
 class HeadEnsemble(nn.Module):
@@ -191,17 +200,23 @@ class HeadEnsemble(nn.Module):
 
     def features(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> HeadFeatures:
         """What the members' last layers read, and the common doubt where there is one."""
-        seen = torch.stack([member.coarse(tokens, class_tokens, image)[1] for member in self._heads])
+        each = [member.see(tokens, class_tokens, image) for member in self._heads]
+        levels = [level for _, level in each if level is not None]
+        features = HeadFeatures(
+            torch.stack([seen for seen, _ in each]), level=torch.stack(levels) if levels else None
+        )
         if self.doubt is None:
-            return HeadFeatures(seen)
-        return HeadFeatures(seen, self.doubt(tokens[:, -1], self.coarse_log_depth(seen)))
+            return features
+        return replace(features, doubt=self.doubt(tokens[:, -1], self.coarse_log_depth(features)))
 
     def decode(self, features: HeadFeatures, change: LastLayerChange | None = None) -> tuple[Tensor, Tensor]:
         """What :meth:`forward` gives, from :meth:`features`."""
         changes = [None] * len(self.members) if change is None else change.weights
         outs = torch.stack([
-            member.decode(seen, features.doubt, own)
-            for member, seen, own in zip(self._heads, features.seen, changes, strict=True)
+            member.decode(seen, level, features.doubt, own)
+            for member, seen, level, own in zip(
+                self._heads, features.seen, self._levels(features), changes, strict=True
+            )
         ])  # fmt: skip
         mean = outs[:, :, 0].mean(dim=0)
         if change is not None:
@@ -210,10 +225,13 @@ class HeadEnsemble(nn.Module):
         # A Laplace distribution of spread b has the variance 2 b^2.
         return mean, self.sigma_scale * math.sqrt(2.0) * outs[:, :, 1].mean(dim=0).exp()
 
-    def coarse_log_depth(self, seen: Tensor) -> Tensor:
+    def coarse_log_depth(self, features: HeadFeatures) -> Tensor:
         """Mean log depth ``(B, H/7, W/7)`` of the members before the upsampling."""
-        outs = [member.out(own)[:, 0] for member, own in zip(self._heads, seen, strict=True)]
-        return torch.stack(outs).mean(dim=0)
+        each = zip(self._heads, features.seen, self._levels(features), strict=True)
+        return torch.stack([member.tell(seen, level)[:, 0] for member, seen, level in each]).mean(dim=0)
+
+    def _levels(self, features: HeadFeatures) -> Sequence[Tensor | None]:
+        return [None] * len(self.members) if features.level is None else list(features.level)
 
 
 def save_head(path: Path, model: HeadEnsemble, about: dict[str, str]) -> None:

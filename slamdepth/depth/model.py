@@ -121,7 +121,7 @@ class Dinov2Depth:
     def coarse_log_depth(self, features: HeadFeatures) -> torch.Tensor:
         """Mean log canonical depth ``(H/7, W/7)`` of the heads before they are upsampled."""
         with torch.inference_mode():
-            return self._head.coarse_log_depth(features.seen)[0]
+            return self._head.coarse_log_depth(features)[0]
 
     def adapting(self) -> AdaptingDinov2:
         """This model while it learns from a map; this one itself stays as it is."""

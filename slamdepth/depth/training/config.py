@@ -91,6 +91,10 @@ class HeadConfig(_Section):
     blocks: int = Field(1, ge=0, le=8, description="residual convolutions at token resolution")
     guide_dim: int = Field(64, ge=4, le=256, description="channels that carry image edges to the upsampling")
     dropout: float = Field(0.2, ge=0, lt=1, description="share of token channels dropped in training")
+    level_dim: int = Field(
+        0, ge=0, le=256, description="channels of a branch that tells a view's scale apart from its relief; "
+        "0: both are told by the same layers",
+    )  # fmt: skip
 
 
 class LossConfig(_Section):

@@ -129,7 +129,8 @@ def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:
 
 def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[float, float]:
     view, taps = config.view, config.head.taps
-    shape = HeadShape(taps, dim, config.head.dim, config.head.blocks, config.head.guide_dim)
+    shape = HeadShape(taps, dim, config.head.dim, config.head.blocks, config.head.guide_dim,
+                      level_dim=config.head.level_dim)  # fmt: skip
     head = DepthHead(shape, config.head.dropout).to(device).train()
     batch = (
         torch.zeros(config.batch, len(taps), dim, view.rows // patch, view.columns // patch, device=device),
