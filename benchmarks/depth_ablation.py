@@ -39,7 +39,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no gradient loss": {"gradient": 0.0},
     "likelihood only": {"gradient": 0.0, "scale_invariant": 0.0},
 }
-_MEMBER = 1
 _SECTIONS = {"dropout": "head", "taps": "head", "dim": "head", "blocks": "head", "gradient": "loss",
              "scale_invariant": "loss"}  # fmt: skip
 
@@ -53,14 +52,10 @@ def variant_config(base: TrainConfig, change: dict[str, Any], *, samples: int, s
     values = config_without(base, None, Path("unused"), samples=samples).model_dump()
     first = base.sources[0].folder
     keep = {"real": (True,), "synthetic": (False,), None: (True, False)}[change.get("sources")]
-    sources = [
-        {**source, "members": None}
-        for source in values["sources"]
-        if (source["folder"] == first) in keep and _is_of_all(source)
-    ]
+    sources = [source for source in values["sources"] if (source["folder"] == first) in keep]
     if "mixed" in change:
         sources = [{**s, "augment": {**s["augment"], "mixed": change["mixed"]}} for s in sources]
-    values |= {"sources": sources, "members": 1}
+    values["sources"] = sources
     for name, value in change.items():
         if name in _SECTIONS:
             values[_SECTIONS[name]][name] = value
@@ -70,11 +65,6 @@ def variant_config(base: TrainConfig, change: dict[str, Any], *, samples: int, s
     values["coarse_epochs"] = max(1, round(steps / steps_per_epoch(base, views)))
     values["fine_epochs"] = 1
     return TrainConfig.from_dict(values, origin="benchmarks.depth_ablation")
-
-
-def _is_of_all(source: dict[str, Any]) -> bool:
-    """One head learns what the shipped head's second member does, which has seen everything."""
-    return source["members"] is None or _MEMBER in source["members"]
 
 
 def main(arguments: list[str]) -> int:

@@ -269,6 +269,9 @@ def test_one_head_of_what_is_not_mixed() -> None:
 
 def test_fewer_members_leave_out_what_only_the_others_learn_from() -> None:
     base = TrainConfig.from_yaml(DEFAULT_CONFIG)
+    of = [(1,) if source.augment is None or not source.augment.mixed else (0, 1) for source in base.sources]
+    told = [s.model_copy(update={"members": m}) for s, m in zip(base.sources, of, strict=True)]
+    base = base.model_copy(update={"members": 2, "sources": tuple(told)})
     config = config_without(base, None, Path("head.safetensors"), overruled={"members": 1})
     assert {source.members for source in config.sources} == {(0,)}
     assert all(source.augment.mixed for source in config.sources)

@@ -25,7 +25,7 @@ from slamdepth.depth.head import (
 )
 from slamdepth.depth.head_layers import convex_upsample
 from slamdepth.depth.layout import check_layout, dinov2_layout, pack_about
-from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, INPUT_AREA, focal_factor, input_size
+from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, INPUT_PX, focal_factor, input_size
 from slamdepth.errors import WeightsError
 from slamdepth.types import Camera
 
@@ -279,12 +279,13 @@ def test_input_size_is_in_patches_and_keeps_the_area(height: int, width: int) ->
     assert rows % 14 == 0
     assert columns % 14 == 0
     if max(height, width) < 3 * min(height, width):
-        assert 0.8 < rows * columns / INPUT_AREA < 1.25
+        assert 0.8 < rows * columns / INPUT_PX < 1.25
 
 
 def test_usual_sizes() -> None:
-    assert input_size(480, 640) == (238, 322)
-    assert input_size(640, 480) == (322, 238)
+    assert input_size(480, 640) == (196, 266)
+    assert input_size(640, 480) == (266, 196)
+    assert input_size(480, 640, 238 * 322) == (238, 322)
 
 
 def test_focal_factor_follows_the_resized_camera() -> None:

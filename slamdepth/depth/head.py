@@ -29,7 +29,7 @@ UPSAMPLING = "weights."
 """Prefix of the parameters that only the upsampling to full resolution uses."""
 FORMAT = "slamdepth-depth-head-3"
 _READABLE = ("slamdepth-depth-head-1", "slamdepth-depth-head-2", FORMAT)
-"""The first format had no ``doubt``, the second no ``level_dim``."""
+"""The first format had no ``doubt``, the second no ``level_dim`` and no ``input_px``."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class HeadShape:
             says how sure they are; 0 where the members themselves do.
         level_dim: channels of the branch that tells a view's mean log depth apart from its relief;
             0 where one branch tells both.
+        input_px: rows times columns of the images it learnt from, and is given.
     """
 
     taps: tuple[int, ...] = (5, 8, 11)
@@ -55,6 +56,7 @@ class HeadShape:
     members: int = 1
     doubt: int = 0
     level_dim: int = 0
+    input_px: int = 238 * 322
 
 
 @dataclass(frozen=True)

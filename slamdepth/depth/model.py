@@ -91,7 +91,8 @@ class Dinov2Depth:
             CameraError: as :meth:`predict`.
         """
         check_size(frame)
-        rows, columns = input_size(*frame.image_rgb.shape[:2])
+        height, width = frame.image_rgb.shape[:2]
+        rows, columns = input_size(height, width, self._head.shape.input_px)
         image = normalised(resize_rgb(frame.image_rgb, rows, columns)[None], self.device)
         with torch.inference_mode():
             tapped = self._backbone(image.to(self._dtype), self._head.shape.taps)
@@ -104,7 +105,7 @@ class Dinov2Depth:
     ) -> DepthPrediction:
         """The prediction for ``frame`` from its :meth:`features`; see :meth:`HeadEnsemble.decode`."""
         height, width = frame.image_rgb.shape[:2]
-        rows, columns = input_size(height, width)
+        rows, columns = input_size(height, width, self._head.shape.input_px)
         with torch.inference_mode():
             log_depth, sigma = self._head.decode(features, change)
             both = torch.stack([log_depth, sigma], dim=1)

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PATCH = 14
-INPUT_AREA = 238 * 322
+INPUT_PX = 196 * 266
+"""Pixels of the network input that the shipped head learnt from."""
+
 CANONICAL_FOCAL_PX = 280.0
 """Focal length, in pixels of the network's input, at which log depth is predicted.
 
@@ -38,10 +40,10 @@ def check_size(frame: Frame) -> None:
         )
 
 
-def input_size(height: int, width: int, area: int = INPUT_AREA) -> tuple[int, int]:
-    """Rows and columns of the network input: multiples of 14 of about ``area`` pixels
+def input_size(height: int, width: int, input_px: int = INPUT_PX) -> tuple[int, int]:
+    """Rows and columns of the network input: multiples of 14 of about ``input_px`` pixels
     that keep the aspect of a ``height`` x ``width`` image."""
-    scale = math.sqrt(area / (height * width))
+    scale = math.sqrt(input_px / (height * width))
     rows = max(1, round(height * scale / PATCH)) * PATCH
     columns = max(1, round(width * scale / PATCH)) * PATCH
     return rows, columns

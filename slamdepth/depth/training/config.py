@@ -76,8 +76,8 @@ class SourceConfig(_Section):
 class ViewConfig(_Section):
     """How a pair is shown to the backbone."""
 
-    rows: int = Field(238, ge=28, multiple_of=14, description="height of the network input")
-    columns: int = Field(322, ge=28, multiple_of=14, description="width of the network input")
+    rows: int = Field(196, ge=28, multiple_of=14, description="height of the network input")
+    columns: int = Field(266, ge=28, multiple_of=14, description="width of the network input")
     min_depth_m: float = Field(0.2, gt=0)
     max_depth_m: float = Field(10.0, gt=0)
     augment: AugmentConfig = AugmentConfig()

@@ -102,7 +102,7 @@ def train_depth(
     dim = encoder.backbone.dim
     shape = HeadShape(
         config.head.taps, dim, config.head.dim, config.head.blocks, config.head.guide_dim, config.members,
-        min(COMPONENTS, dim) if folds else 0, config.head.level_dim,
+        min(COMPONENTS, dim) if folds else 0, config.head.level_dim, config.view.rows * config.view.columns,
     )  # fmt: skip
     key = digest(config, [plan.folder.name for plan in planned])
     ensemble = HeadEnsemble(shape)
