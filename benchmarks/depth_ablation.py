@@ -55,7 +55,7 @@ def variant_config(base: TrainConfig, change: dict[str, Any], *, samples: int, s
     sources = [source for source in values["sources"] if (source["folder"] == first) in keep]
     if "mixed" in change:
         sources = [{**s, "augment": {**s["augment"], "mixed": change["mixed"]}} for s in sources]
-    values["sources"] = sources
+    values |= {"sources": sources, "members": 1}
     for name, value in change.items():
         if name in _SECTIONS:
             values[_SECTIONS[name]][name] = value
