@@ -10,8 +10,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from slamdepth.depth.dpt import ResidualUnit
 from slamdepth.depth.head import HeadShape
-from slamdepth.depth.head_layers import USUAL_DEPTH_M
+from slamdepth.depth.head_layers import FACTOR, USUAL_DEPTH_M
+from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
 from slamdepth.depth.training.config import LossConfig
 from slamdepth.depth.training.losses import total_loss
 from slamdepth.depth.training.mlp import mse_ssim_loss
@@ -20,7 +22,7 @@ Loss = Callable[[Tensor, Tensor], Tensor]
 """Of log depth and log spread ``(B, 2, h, w)`` and canonical depth ``(B, h, w)``, 0 unknown."""
 
 _DPT_CHANNELS = 48
-_CANONICAL_FOCAL_CELLS = 280.0 / 7
+_CANONICAL_FOCAL_CELLS = CANONICAL_FOCAL_PX / FACTOR
 
 
 def _output(channels: int) -> nn.Conv2d:
@@ -28,10 +30,6 @@ def _output(channels: int) -> nn.Conv2d:
     nn.init.normal_(out.weight, std=1e-3)
     out.bias = nn.Parameter(torch.tensor([math.log(USUAL_DEPTH_M), math.log(0.3)]))
     return out
-
-
-def _twice(x: Tensor) -> Tensor:
-    return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
 
 class LinearHead(nn.Module):
@@ -47,19 +45,7 @@ class LinearHead(nn.Module):
         del image
         x, cls = tokens.flatten(1, 2), class_tokens.flatten(1)[..., None, None]
         x = self.drop(torch.cat([x, cls.expand(-1, -1, *x.shape[2:])], dim=1))
-        return _twice(self.out(x)), x
-
-
-class _Unit(nn.Module):
-    """Residual convolutions of DPT (Ranftl et al. 2021)."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
-        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.conv2(F.relu(self.conv1(F.relu(x))))
+        return F.interpolate(self.out(x), scale_factor=2, mode="bilinear", align_corners=False), x
 
 
 class DptLikeHead(nn.Module):
@@ -71,8 +57,8 @@ class DptLikeHead(nn.Module):
         self.drop = nn.Dropout2d(dropout)
         taps = range(len(shape.taps))
         self.read = nn.ModuleList(nn.Conv2d(2 * shape.token_dim, _DPT_CHANNELS, 1) for _ in taps)
-        self.refine = nn.ModuleList(_Unit(_DPT_CHANNELS) for _ in taps)
-        self.fuse = nn.ModuleList(_Unit(_DPT_CHANNELS) for _ in taps)
+        self.refine = nn.ModuleList(ResidualUnit(_DPT_CHANNELS) for _ in taps)
+        self.fuse = nn.ModuleList(ResidualUnit(_DPT_CHANNELS) for _ in taps)
         self.last = nn.Conv2d(_DPT_CHANNELS, 32, 3, padding=1)
         self.out = _output(32)
 

@@ -33,7 +33,7 @@ from slamdepth.depth.head import DepthHead, HeadShape
 from slamdepth.depth.training.caches import Encoder, fill_cache, open_encoder, plan_caches
 from slamdepth.depth.training.config import TrainConfig, digest
 from slamdepth.depth.training.features import FeatureCache, load_batch
-from slamdepth.depth.training.loop import learning_rate
+from slamdepth.depth.training.loop import head_shape, learning_rate
 from slamdepth.depth.training.losses import total_loss
 from slamdepth.depth.training.stages import coarse_target, predict
 from slamdepth.errors import SlamdepthError
@@ -113,11 +113,7 @@ def train_head(
         torch.manual_seed(seed)
         order = np.random.default_rng(seed)
         samples = np.array([(c, k) for c, cache in enumerate(caches) for k in range(len(cache))])
-        shape = HeadShape(
-            config.head.taps, dim, config.head.dim, config.head.blocks, config.head.guide_dim,
-            level_dim=config.head.level_dim,
-        )  # fmt: skip
-        head = trial.build(shape, config.head.dropout).train()
+        head = trial.build(head_shape(config, dim), config.head.dropout).train()
         optimiser = torch.optim.AdamW(
             head.parameters(), config.learning_rate, weight_decay=config.weight_decay
         )

@@ -42,7 +42,9 @@ BASE = DptShape(768, 12, 12, (2, 5, 8, 11), 128, (96, 192, 384, 768))
 LARGE = DptShape(1024, 24, 16, (4, 11, 17, 23), 256, (256, 512, 1024, 1024))
 
 
-class _Residual(nn.Module):
+class ResidualUnit(nn.Module):
+    """Two convolutions beside the identity (Ranftl et al. 2021), named as in the official files."""
+
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
@@ -58,8 +60,8 @@ class _Fusion(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.resConfUnit1 = _Residual(channels)
-        self.resConfUnit2 = _Residual(channels)
+        self.resConfUnit1 = ResidualUnit(channels)
+        self.resConfUnit2 = ResidualUnit(channels)
         self.out_conv = nn.Conv2d(channels, channels, 1)
 
     def forward(self, x: Tensor, finer: Tensor | None, size: tuple[int, int]) -> Tensor:

@@ -100,10 +100,7 @@ def train_depth(
     ]
     judging = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None]
     dim = encoder.backbone.dim
-    shape = HeadShape(
-        config.head.taps, dim, config.head.dim, config.head.blocks, config.head.guide_dim, config.members,
-        min(COMPONENTS, dim) if folds else 0, config.head.level_dim, config.view.rows * config.view.columns,
-    )  # fmt: skip
+    shape = head_shape(config, dim, doubt=min(COMPONENTS, dim) if folds else 0)
     key = digest(config, [plan.folder.name for plan in planned])
     ensemble = HeadEnsemble(shape)
     history: list[EpochFigures] = []
@@ -156,6 +153,21 @@ def train_depth(
     except OSError as error:
         raise OutputError(f"{output}: cannot be written: {error.strerror}") from error
     return result
+
+
+def head_shape(config: TrainConfig, token_dim: int, *, doubt: int = 0) -> HeadShape:
+    """The heads that ``config`` asks for, on tokens of ``token_dim`` channels."""
+    return HeadShape(
+        config.head.taps,
+        token_dim,
+        config.head.dim,
+        config.head.blocks,
+        config.head.guide_dim,
+        members=config.members,
+        doubt=doubt,
+        level_dim=config.head.level_dim,
+        input_px=config.view.rows * config.view.columns,
+    )
 
 
 def _stage(plan: PlannedCache, index: int, planned: list[PlannedCache]) -> str:

@@ -19,7 +19,7 @@ from slamdepth.depth.training.caches import Encoder, benchmarks_seen, of_member,
 from slamdepth.depth.training.config import TrainConfig
 from slamdepth.depth.training.data import PlaceReader
 from slamdepth.depth.training.features import encode, sample_specs
-from slamdepth.depth.training.loop import steps_per_epoch
+from slamdepth.depth.training.loop import head_shape, steps_per_epoch
 from slamdepth.depth.training.losses import total_loss
 from slamdepth.depth.training.out_of_fold import plan_folds
 from slamdepth.depth.training.stages import predict
@@ -129,9 +129,7 @@ def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:
 
 def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[float, float]:
     view, taps = config.view, config.head.taps
-    shape = HeadShape(taps, dim, config.head.dim, config.head.blocks, config.head.guide_dim,
-                      level_dim=config.head.level_dim)  # fmt: skip
-    head = DepthHead(shape, config.head.dropout).to(device).train()
+    head = DepthHead(head_shape(config, dim), config.head.dropout).to(device).train()
     batch = (
         torch.zeros(config.batch, len(taps), dim, view.rows // patch, view.columns // patch, device=device),
         torch.zeros(config.batch, len(taps), dim, device=device),

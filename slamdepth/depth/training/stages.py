@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from slamdepth.depth.head import DepthHead
+from slamdepth.depth.head_layers import FACTOR
 
-COARSE = 7
 FINE_COST = 5
 """A step at full resolution costs about so many at 1/7."""
 
@@ -28,7 +28,7 @@ def predict(head: DepthHead, batch: Batch, is_fine: bool) -> tuple[Tensor, Tenso
 def coarse_target(target: Tensor) -> Tensor:
     """Median of the known depths of each 7 x 7 block of ``(B, H, W)``; 0 where there are none."""
     batch, rows, columns = target.shape
-    blocks = target.reshape(batch, rows // COARSE, COARSE, columns // COARSE, COARSE)
+    blocks = target.reshape(batch, rows // FACTOR, FACTOR, columns // FACTOR, FACTOR)
     blocks = blocks.permute(0, 1, 3, 2, 4).flatten(3)
     known = torch.where(blocks > 0, blocks, torch.nan)
     return known.nanmedian(dim=-1).values.nan_to_num(0.0)
