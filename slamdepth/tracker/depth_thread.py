@@ -43,13 +43,11 @@ class DepthThread:
 
     def take(self, frame: Frame) -> DepthPrediction:
         """The prediction for ``frame``; waits for it. The last one taken can be taken again."""
-        self.ask(frame)
-        for n, (asked, prediction) in enumerate(self._asked):
-            if asked is frame:
-                self._taken = (frame, prediction.result())
-                del self._asked[n]
-                break
-        assert self._taken is not None
+        if self._taken is None or self._taken[0] is not frame:
+            self.ask(frame)
+            n = next(n for n, (asked, _) in enumerate(self._asked) if asked is frame)
+            self._taken = (frame, self._asked[n][1].result())
+            del self._asked[n]
         return self._taken[1]
 
     def again(self, frame: Frame, *, as_trained: bool = False) -> DepthPrediction:

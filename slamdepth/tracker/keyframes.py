@@ -133,10 +133,9 @@ class Keyframes:
                 frame, features, placement.T_camera_world, placement.point_ids, velocity
             )
         self._rule.keyframe_made()
-        is_early = len(self._map.keyframes) <= _WAITED_FOR
-        at_once = is_early or self._depth.is_instant(frame)
-        self._waiting.append(_Waiting(keyframe, 0 if at_once else self._config.tracking.depth_delay))
-        if is_early:
+        delay = 0 if self._depth.is_instant(frame) else self._config.tracking.depth_delay
+        self._waiting.append(_Waiting(keyframe, delay))
+        if len(self._map.keyframes) <= _WAITED_FOR:
             self.join()
         return keyframe
 

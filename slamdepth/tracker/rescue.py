@@ -49,7 +49,7 @@ class CloudRescue:
         scale = 1.0 if prediction.is_sensor else self._map.keyframes[-1].scale
         depth_m = prediction.values * np.float32(scale)
         cloud_c = self._cloud(depth_m)
-        recent = [k for k in self._map.keyframes if k.prediction is not None][-_MAP_KEYFRAMES:]
+        recent = self._map.keyframes[-_MAP_KEYFRAMES:]
         map_w = np.concatenate([self._keyframe_cloud_w(k) for k in recent])
         if len(cloud_c) < 200 or len(map_w) < 200:
             return None
