@@ -125,7 +125,7 @@ class World:
         assert len(rows) == len(free)
         seen = seen[own]
         self._follow(seen, keyframe.point_ids[own])
-        self.closer.add(keyframe)
+        self.closer.add(keyframe, self.closer.describe(features))
         correction = self.closer.close(keyframe)
         if correction is not None:
             self.corrections.append((k, correction))
@@ -355,7 +355,7 @@ def test_no_loop_between_two_places_that_only_look_alike() -> None:
     )
     world.map.add_keyframe(impostor)
     poses = np.stack([k.T_camera_world for k in world.map.keyframes])
-    world.closer.add(impostor)
+    world.closer.add(impostor, world.closer.describe(fake))
     assert world.closer.candidates(impostor)[:1] == [0]
     assert world.closer.close(impostor) is None
     np.testing.assert_array_equal(np.stack([k.T_camera_world for k in world.map.keyframes]), poses)

@@ -58,9 +58,12 @@ class PlaceRecogniser:
         Raises:
             TrackingError: the keyframe is already there.
         """
+        self.add_vector(keyframe_id, self.describe(descriptors))
+
+    def add_vector(self, keyframe_id: int, vector: NDArray[np.float32]) -> None:
+        """The same by its place vector, see :meth:`describe`."""
         if keyframe_id in self._row_of:
             raise TrackingError(f"place recognition: keyframe {keyframe_id} was added before")
-        vector = self.describe(descriptors)
         row = len(self._ids)
         if row == len(self._vectors):
             self._vectors = np.concatenate([self._vectors, np.empty_like(self._vectors)])

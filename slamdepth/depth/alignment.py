@@ -92,11 +92,12 @@ class DepthField:
         variance = sigma**2 + s.common_sigma**2
         if self._factor is None:
             return np.full(len(px), self.offset), np.sqrt(variance)
-        from scipy.linalg import cho_solve
+        from scipy.linalg import solve_triangular
 
         K = self._kernel(px, log_predicted, sigma, self._px, self._log, self._sigma)
         mean = self.offset + K @ self._solved
-        reduction = np.einsum("ij,ji->i", K, cho_solve(self._factor, K.T, check_finite=False))
+        half = solve_triangular(self._factor[0], K.T, lower=self._factor[1], check_finite=False)
+        reduction = np.einsum("ij,ij->j", half, half)
         floor = s.white_share * sigma**2
         return mean, np.sqrt(np.maximum(variance - reduction, np.maximum(floor, 1e-6)))
 

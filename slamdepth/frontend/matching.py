@@ -39,11 +39,14 @@ class PixelGrid:
         counts = np.bincount(flat, minlength=self._columns * self._rows)
         self._starts = np.concatenate([[0], np.cumsum(counts)])
 
-    def pairs_within(self, query_px: Floats, radius_px: Floats) -> tuple[Ints, Ints]:
+    def pairs_within(
+        self, query_px: Floats, radius_px: Floats, half_px: Floats | None = None
+    ) -> tuple[Ints, Ints]:
         """All pairs ``(query, pixel)`` closer than the query's radius.
 
         Args:
             query_px: ``(M, 2)``; radius_px: ``(M,)`` pixels.
+            half_px: ``(M, 2)`` how far along each axis to look; pairs beyond may be left out.
 
         Returns:
             Two index arrays of equal length, sorted by query.
@@ -52,10 +55,11 @@ class PixelGrid:
             empty = np.zeros(0, dtype=np.int64)
             return empty, empty
         # of each query: the columns and rows of cells that its circle may touch
+        half = radius_px[:, None] if half_px is None else np.minimum(half_px, radius_px[:, None])
         centre = query_px - self._low
         limit = np.array([self._columns, self._rows]) - 1
-        first = np.clip(np.floor((centre - radius_px[:, None]) / self._cell), 0, limit + 1).astype(np.int64)
-        last = np.clip(np.floor((centre + radius_px[:, None]) / self._cell), -1, limit).astype(np.int64)
+        first = np.clip(np.floor((centre - half) / self._cell), 0, limit + 1).astype(np.int64)
+        last = np.clip(np.floor((centre + half) / self._cell), -1, limit).astype(np.int64)
         height = np.where(last[:, 0] >= first[:, 0], np.maximum(last[:, 1] - first[:, 1] + 1, 0), 0)
         # a row of cells is one run of the sorted pixels
         query, offset = _expand(height)

@@ -26,6 +26,8 @@ CHI2_2DOF_95 = 5.991
 HUBER = 1.345
 _NEAREST_M = 0.02
 _CONVERGED = 1e-5  # metres and radians: a hundredth of a pixel
+_SETTLING = 2e-4  # enough to tell outliers by
+_REWHITEN = 0.01  # metres and radians within which a point's doubt looks the same
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def refine_pose(
     active = np.ones(len(points_w), dtype=bool)
     H = np.eye(6) * 1e-6
     P = match.seen_from(T)
-    whitening = match.whitening(T, P)
+    whitening, T_whitened = match.whitening(T, P), T
     for round_ in range(rounds):
         robust = round_ < rounds - 1
         use = np.flatnonzero(active & (P[2] > _NEAREST_M))
@@ -116,14 +118,25 @@ def refine_pose(
             part, W = match.taken(use), whitening[:, use]
             for _ in range(iterations):
                 H, g = part.normal_equations(part.seen_from(T), W, robust=robust)
-                step = -np.linalg.solve(H + np.eye(6) * 1e-9 * np.trace(H), g)
+                step = _newton_step(H, g)
                 T = se3_exp(step) @ T
-                if np.abs(step).max() < _CONVERGED:
+                if np.abs(step).max() < (_SETTLING if robust else _CONVERGED):
                     break
         P = match.seen_from(T)
-        whitening = match.whitening(T, P)
+        if np.abs(T - T_whitened).max() > _REWHITEN:
+            whitening, T_whitened = match.whitening(T, P), T
         active = (P[2] > _NEAREST_M) & (match.squared_residual(P, whitening) < gate)
     return PoseEstimate(T, active, H)
+
+
+def _newton_step(H: Floats, g: Floats) -> Floats:
+    """``-H^-1 g`` for ``H (6, 6)``; LAPACK at once, as NumPy's checks take longer than the solution."""
+    from scipy.linalg.lapack import dposv
+
+    damped = H.copy()
+    damped.flat[::7] += 1e-9 * H.trace()
+    _, step, info = dposv(damped, g)
+    return -step if info == 0 else -np.linalg.lstsq(damped, g, rcond=None)[0]
 
 
 class _Matches:

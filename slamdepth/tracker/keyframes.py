@@ -8,16 +8,20 @@ and the window is adjusted. Meanwhile another frame may become a keyframe. When 
 happens depends on the frames alone and not on how fast the network was, so the trajectory
 is the same on every machine.
 
-What follows the depth is spread over three frames, so that none of them takes long.
+What follows the depth is spread over several frames, so that none of them takes long. The window is
+adjusted in a thread beside, from a copy, and taken over three frames later.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth.backend.bundle import BundleResult
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import orthonormalised
@@ -30,8 +34,9 @@ from slamdepth.tracker.keyframe_rule import KeyframeRule
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Placement
 from slamdepth.tracker.loop_closer import LoopCloser
-from slamdepth.tracker.map_adjuster import MapAdjuster
+from slamdepth.tracker.map_adjuster import Adjustment, MapAdjuster
 from slamdepth.tracker.shutter import Shutter
+from slamdepth.tracker.side_thread import SideThread
 from slamdepth.tracker.stopwatch import Stopwatch
 from slamdepth.types import Frame
 
@@ -41,15 +46,17 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _MOST_WAITING = 2  # keyframes; with three, points are missed that the oldest would have given birth to
+_ADJUSTED_IN = 2  # frames between those in which the adjustment of a window begins and is taken over
 _WAITED_FOR = 4  # first keyframes whose depth is waited for: all that follows stands on their points
-_STAGES = 3
 
 
 @dataclass
 class _Waiting:
     keyframe: MapKeyframe
     frames_left: int
+    words: Future[NDArray[np.float32]]
     stages_done: int = 0
+    adjustment: Adjustment | None = None
 
 
 @dataclass
@@ -90,6 +97,7 @@ class Keyframes:
         depth: DepthThread,
         shutter: Shutter,
         watch: Stopwatch,
+        side: SideThread,
         teaching: MapTeaching | None = None,
     ) -> None:
         self._config = config
@@ -102,9 +110,17 @@ class Keyframes:
         self._shutter = shutter
         self._timed = watch.timed
         self.store = KeyframeStore(config.map.keyframe_memory_mib)
+        self._side = side
         self._teaching = teaching
         self._rule = KeyframeRule(config, landmarks)
         self._waiting: list[_Waiting] = []  # oldest first
+        self._readout: Future[BundleResult] | None = None
+        self._stages: list[Callable[[_Waiting], Floats | None]] = [
+            self._give_birth,
+            *[self._let_adjust] * _ADJUSTED_IN,
+            self._take_over,
+            self._close_loops,
+        ]
 
     def wants(self, placement: Placement) -> bool:
         """Whether a frame should become a keyframe; see :class:`KeyframeRule`."""
@@ -112,13 +128,18 @@ class Keyframes:
 
     @property
     def is_full(self) -> bool:
-        """Whether one more keyframe has to wait until the oldest waiting one has joined."""
-        return len(self._waiting) >= _MOST_WAITING
+        """Whether one more keyframe has to wait until the oldest has given birth to its points."""
+        return sum(waiting.stages_done == 0 for waiting in self._waiting) >= _MOST_WAITING
 
     @property
     def is_due(self) -> bool:
         """Whether the oldest waiting keyframe's time has come."""
         return bool(self._waiting) and self._waiting[0].frames_left <= 0
+
+    @property
+    def is_adjusting(self) -> bool:
+        """Whether an adjustment is on its way, which remembers rows of points."""
+        return bool(self._waiting) and self._waiting[0].adjustment is not None
 
     def count_frame(self) -> None:
         """Tell that another frame has come."""
@@ -134,32 +155,37 @@ class Keyframes:
             )
         self._rule.keyframe_made()
         delay = 0 if self._depth.is_instant(frame) else self._config.tracking.depth_delay
-        self._waiting.append(_Waiting(keyframe, delay))
+        words = self._side.ask(self._loops.describe, keyframe.features)
+        self._waiting.append(_Waiting(keyframe, delay, words))
         if len(self._map.keyframes) <= _WAITED_FOR:
             self.join()
         return keyframe
 
-    def join(self, *, keyframes: int | None = None, stages: int | None = None) -> Moved | None:
+    def join(self, *, until_born: bool = False, stages: int | None = None) -> Moved | None:
         """Go on with the waiting keyframes, oldest first: by default until none waits.
 
         Args:
-            keyframes: at most so many are finished.
+            until_born: only until one more has given birth to its points.
             stages: at most so many stages are done.
 
         Returns:
             How the map moved around the newest keyframe; None where no keyframe waits.
         """
+        if stages is None and not until_born:
+            self._learn_readout()
         if not self._waiting:
             return None
         anchor = self._map.keyframes[-1]
         moved = Moved(anchor, anchor.T_world_camera)
-        left = _STAGES * len(self._waiting) if stages is None else stages
-        kept = 0 if keyframes is None else len(self._waiting) - keyframes
-        while len(self._waiting) > kept and left > 0:
-            scales = self._next_stage(self._waiting[0])
+        left = len(self._stages) * len(self._waiting) if stages is None else stages
+        while self._waiting and left > 0:
+            oldest = self._waiting[0]
+            scales = self._next_stage(oldest)
             if scales is not None:
                 moved.scale *= float(scales[anchor.id])
             left -= 1
+            if until_born and oldest.stages_done == 1:
+                break
         return moved
 
     def _next_stage(self, waiting: _Waiting) -> Floats | None:
@@ -168,17 +194,14 @@ class Keyframes:
         Returns:
             ``(K,)`` what the metres of each keyframe were multiplied by, where a loop was closed.
         """
+        stage = self._stages[waiting.stages_done]
         waiting.stages_done += 1
-        if waiting.stages_done == 1:
-            self._give_birth(waiting.keyframe)
-        elif waiting.stages_done == 2:
-            self._adjust(waiting.keyframe)
-        else:
+        if waiting.stages_done == len(self._stages):
             del self._waiting[0]
-            return self._close_loops(waiting.keyframe)
-        return None
+        return stage(waiting)
 
-    def _give_birth(self, keyframe: MapKeyframe) -> None:
+    def _give_birth(self, waiting: _Waiting) -> None:
+        keyframe = waiting.keyframe
         with self._timed("depth"):
             prediction = self._depth.take(keyframe.frame)
         with self._timed("mapping"):
@@ -186,6 +209,8 @@ class Keyframes:
             self._mapper.give_birth(keyframe, prediction)
             self._mapper.search_neighbours(keyframe)
         self._rule.points_born()
+        with self._timed("bundle"):
+            waiting.adjustment = self._mapper.begin_window(keyframe)
 
     def _follow_motion(self, keyframe: MapKeyframe) -> None:
         """Use that the frames after the keyframe tell how it moved."""
@@ -195,15 +220,32 @@ class Keyframes:
         if self._shutter.rolls:
             self._shutter.correct_keyframe(keyframe)
 
-    def _adjust(self, keyframe: MapKeyframe) -> None:
+    def _let_adjust(self, waiting: _Waiting) -> None:
+        """Leave the thread beside a frame's time."""
+
+    def _take_over(self, waiting: _Waiting) -> None:
+        self._learn_readout()
         with self._timed("bundle"):
-            self._mapper.adjust_window(keyframe)
-            if self._shutter.is_due(keyframe.id + 1) and self._adjuster.find_readout():
+            if waiting.adjustment is not None:
+                self._adjuster.complete(waiting.adjustment)
+                waiting.adjustment = None
+            if self._shutter.is_due(waiting.keyframe.id + 1):
+                self._readout = self._adjuster.begin_readout()
+
+    def _learn_readout(self) -> None:
+        """Take over what the thread beside found out of the shutter, should it have been asked."""
+        if self._readout is None:
+            return
+        with self._timed("bundle"):
+            is_new = self._adjuster.complete_readout(self._readout)
+            self._readout = None
+            if is_new:
                 self._shutter.correct_keyframes()
 
-    def _close_loops(self, keyframe: MapKeyframe) -> Floats | None:
+    def _close_loops(self, waiting: _Waiting) -> Floats | None:
+        keyframe = waiting.keyframe
         with self._timed("loops"):
-            self._loops.add(keyframe)
+            self._loops.add(keyframe, waiting.words.result())
             correction = self._loops.close(keyframe)
         if correction is not None:
             self._log.rescale(correction.scales)

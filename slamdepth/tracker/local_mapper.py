@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.backend.bundle import BundleResult
 from slamdepth.config import Config
 from slamdepth.depth.alignment import (
     DepthField,
@@ -20,7 +19,7 @@ from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.localiser import Localiser
-from slamdepth.tracker.map_adjuster import MapAdjuster
+from slamdepth.tracker.map_adjuster import Adjustment, MapAdjuster
 from slamdepth.types import Camera, DepthPrediction, Frame
 
 if TYPE_CHECKING:
@@ -28,6 +27,8 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
+
+_LOCAL_STEPS = (3, 3)
 
 
 class LocalMapper:
@@ -168,8 +169,16 @@ class LocalMapper:
         stronger = landmarks.observations[mine] > landmarks.observations[theirs]
         landmarks.merge(np.where(stronger, theirs, mine), np.where(stronger, mine, theirs))
 
-    def adjust_window(self, keyframe: MapKeyframe) -> BundleResult | None:
+    def adjust_window(self, keyframe: MapKeyframe) -> None:
         """Local bundle adjustment of the keyframe and those that see most of its points."""
+        self._adjuster.adjust(*self._window(keyframe), _LOCAL_STEPS)
+
+    def begin_window(self, keyframe: MapKeyframe) -> Adjustment | None:
+        """The same in the thread beside; see :meth:`MapAdjuster.begin`."""
+        return self._adjuster.begin(*self._window(keyframe), _LOCAL_STEPS)
+
+    def _window(self, keyframe: MapKeyframe) -> tuple[list[int], list[int], Ints]:
+        """Keyframes to move, keyframes that hold them, and the points between."""
         landmarks, config = self._map, self._config.bundle
         own = keyframe.point_ids[keyframe.point_ids >= 0]
         window = landmarks.covisible(own, config.window, minimum=10)
@@ -181,7 +190,7 @@ class LocalMapper:
         around[window] = 0
         order = np.argsort(-around, kind="stable")[: config.fixed]
         fixed = [int(k) for k in order if around[k] > 0]
-        return self._adjuster.adjust(window, fixed, rows, (3, 3))
+        return window, fixed, rows
 
     def cull(self, keyframe: MapKeyframe) -> None:
         """Remove points that are seldom found where they should be."""

@@ -123,7 +123,9 @@ class Localiser:
             np.maximum(half_trace**2 - (S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2), 0.0)
         )
         reach = np.minimum(radius_px * octave_scale + sigmas * np.sqrt(largest), max_px)
-        q, t = features.grid.pairs_within(visible.px, reach)
+        # the box around the ellipse below, which along a short epipolar line is much narrower
+        box = np.sqrt(MAHALANOBIS_GATE * S[:, (0, 1), (0, 1)] + ((radius_px * octave_scale) ** 2)[:, None])
+        q, t = features.grid.pairs_within(visible.px, reach, box)
         step = features.octave[t] - visible.octave[q]
         ok = (step >= -1) & (step <= 1)
         q, t = q[ok], t[ok]

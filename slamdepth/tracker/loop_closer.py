@@ -12,6 +12,7 @@ import numpy as np
 from slamdepth.backend.places import PlaceRecogniser
 from slamdepth.backend.pose_graph import Edge, PoseGraphResult, optimise_pose_graph
 from slamdepth.config import Config
+from slamdepth.frontend.features import Features
 from slamdepth.geometry import invert, rotation_angle_rad, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.localiser import Localiser, Placement
@@ -54,9 +55,17 @@ class LoopCloser:
         self._last: tuple[int, int] | None = None
         self.count = 0
 
-    def add(self, keyframe: MapKeyframe) -> None:
-        """Let the keyframe be found by later ones."""
-        self.places.add(keyframe.id, keyframe.features.place_descriptors)
+    def describe(self, features: Features) -> NDArray[np.float32]:
+        """The words an image shows; any thread may ask."""
+        return self.places.describe(features.place_descriptors)
+
+    def add(self, keyframe: MapKeyframe, words: NDArray[np.float32]) -> None:
+        """Let the keyframe be found by later ones.
+
+        Args:
+            words: what :meth:`describe` says of its features.
+        """
+        self.places.add_vector(keyframe.id, words)
 
     def close(self, keyframe: MapKeyframe) -> Correction | None:
         """Look for a loop at ``keyframe``; on success the map has been corrected."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,9 +11,10 @@ import numpy as np
 
 from slamdepth.backend.bundle import BundleProblem, BundleResult, bundle_adjust
 from slamdepth.config import Config
-from slamdepth.geometry import invert, transform
+from slamdepth.geometry import invert, orthonormalised, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.shutter import Shutter
+from slamdepth.tracker.side_thread import SideThread
 from slamdepth.types import Camera
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 _MIN_OBSERVATIONS = 30
 _READOUT_KEYFRAMES = 20  # among the recent ones, when the readout time is sought on the way
+_READOUT_STEPS = (3, 3)
 
 
 @dataclass(frozen=True)
@@ -35,14 +38,26 @@ class _Part:
     obs_feature: Ints
 
 
-class MapAdjuster:
-    """Adjusts keyframes and points of a :class:`LandmarkMap`."""
+@dataclass(frozen=True)
+class Adjustment:
+    """One on its way: of a part of the map as it was when there were so many keyframes."""
 
-    def __init__(self, camera: Camera, config: Config, landmarks: LandmarkMap, shutter: Shutter) -> None:
+    part: _Part
+    keyframes: int
+    result: Future[BundleResult]
+
+
+class MapAdjuster:
+    """Adjusts keyframes and points of a :class:`LandmarkMap`, at once or in a thread beside."""
+
+    def __init__(
+        self, camera: Camera, config: Config, landmarks: LandmarkMap, shutter: Shutter, side: SideThread
+    ) -> None:
         self._camera = camera.without_distortion()
         self._config = config
         self._map = landmarks
         self._shutter = shutter
+        self._side = side
 
     def adjust(
         self, window: list[int], fixed: list[int], rows: Ints, iterations: tuple[int, ...]
@@ -59,13 +74,35 @@ class MapAdjuster:
             return None
         result = bundle_adjust(part.problem, iterations)
         self._take_over(part, result)
-        bad = ~result.inlier
-        ids = np.array([k.id for k in part.keyframes])
-        self._map.drop_observations(ids[part.problem.obs_camera[bad]], part.obs_feature[bad])
         return result
 
-    def find_readout(self, window: list[int] | None = None) -> bool:
-        """Look for the shutter's readout time in some keyframes, by default the recent ones.
+    def begin(
+        self, window: list[int], fixed: list[int], rows: Ints, iterations: tuple[int, ...]
+    ) -> Adjustment | None:
+        """The same in the thread beside. Until it is completed the map may get more keyframes, without
+        points of their own, and poses may be read; no point may be merged, die or change its row.
+
+        Returns:
+            None where there is too little to adjust.
+        """
+        part = self._part(window, fixed, rows)
+        if part is None:
+            return None
+        result = self._side.ask(bundle_adjust, part.problem, iterations)
+        return Adjustment(part, len(self._map.keyframes), result)
+
+    def complete(self, adjustment: Adjustment) -> None:
+        """Wait for an adjustment and let the map take it over; keyframes made since then move along."""
+        newest = max(adjustment.part.keyframes, key=lambda keyframe: keyframe.id)
+        T_world_newest = newest.T_world_camera
+        self._take_over(adjustment.part, adjustment.result.result())
+        for keyframe in self._map.keyframes[adjustment.keyframes :]:
+            keyframe.T_camera_world = orthonormalised(
+                keyframe.T_camera_world @ T_world_newest @ newest.T_camera_world
+            )
+
+    def find_readout(self, window: list[int]) -> bool:
+        """Look for the shutter's readout time in some keyframes.
 
         It is one more unknown of an adjustment whose poses and points are thrown away: while
         it is no more than a supposition, the map must not depend on it.
@@ -73,15 +110,24 @@ class MapAdjuster:
         Returns:
             Whether the readout time is another now; keyframes have to follow.
         """
-        if window is None:
-            last = len(self._map.keyframes)
-            window = list(range(max(0, last - _READOUT_KEYFRAMES), last))
+        part = self._readout_part(window)
+        return part is not None and self._learn(bundle_adjust(part.problem, _READOUT_STEPS))
+
+    def begin_readout(self) -> Future[BundleResult] | None:
+        """Look for it in the recent keyframes in the thread beside; None where there is too little."""
+        last = len(self._map.keyframes)
+        part = self._readout_part(list(range(max(0, last - _READOUT_KEYFRAMES), last)))
+        return None if part is None else self._side.ask(bundle_adjust, part.problem, _READOUT_STEPS)
+
+    def complete_readout(self, result: Future[BundleResult]) -> bool:
+        """Wait for it; returns what :meth:`find_readout` does."""
+        return self._learn(result.result())
+
+    def _readout_part(self, window: list[int]) -> _Part | None:
         rows = self._map.points_of(window)
-        rows = rows[self._map.observations[rows] >= 3]
-        part = self._part(window, [], rows, find_readout=True)
-        if part is None:
-            return False
-        result = bundle_adjust(part.problem, (3, 3))
+        return self._part(window, [], rows[self._map.observations[rows] >= 3], find_readout=True)
+
+    def _learn(self, result: BundleResult) -> bool:
         assert result.readout_sigma_s is not None
         return self._shutter.learn(result.readout_s, result.readout_sigma_s)
 
@@ -146,3 +192,6 @@ class MapAdjuster:
         landmarks.position_w[rows] = result.points_w
         landmarks.covariance_w[rows] = result.covariance_w
         landmarks.refresh_views(rows)
+        bad = ~result.inlier
+        ids = np.array([k.id for k in part.keyframes])
+        landmarks.drop_observations(ids[part.problem.obs_camera[bad]], part.obs_feature[bad])

@@ -3,9 +3,15 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
+
+_lock = threading.Lock()
+_inside = 0
+_limit: Any = None
 
 
 @lru_cache(maxsize=1)
@@ -15,13 +21,25 @@ def _controller() -> Any:
     return ThreadpoolController()
 
 
-def one_blas_thread() -> AbstractContextManager[Any]:
-    """Limit NumPy's and SciPy's BLAS to one thread inside.
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Limit NumPy's and SciPy's BLAS to one thread while any thread is inside.
 
     For small matrices two spend more time waiting than working, and sums then do not depend
-    on the number of cores.
+    on the number of cores. The number is the whole process's, so the last to leave sets it back.
     """
-    return _controller().limit(limits=1, user_api="blas")
+    global _inside, _limit
+    with _lock:
+        if _inside == 0:
+            _limit = _controller().limit(limits=1, user_api="blas")
+        _inside += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _inside -= 1
+            if _inside == 0:
+                _limit.restore_original_limits()
 
 
 def one_thread_here() -> None:

@@ -31,6 +31,7 @@ from slamdepth.tracker.motion import Motion
 from slamdepth.tracker.prepare import Preparation, Prepared, load_libraries
 from slamdepth.tracker.rescue import CloudRescue
 from slamdepth.tracker.shutter import Shutter
+from slamdepth.tracker.side_thread import SideThread
 from slamdepth.tracker.stopwatch import Stopwatch
 from slamdepth.tracker.threads import one_blas_thread
 from slamdepth.types import (
@@ -82,7 +83,8 @@ class Tracker:
         self._map = LandmarkMap()
         self._localiser = Localiser(camera, self.config, self._map, self._preparation.levels)
         self._shutter = Shutter(camera, self.config.shutter, self._map)
-        self._adjuster = MapAdjuster(camera, self.config, self._map, self._shutter)
+        self._side = SideThread()
+        self._adjuster = MapAdjuster(camera, self.config, self._map, self._shutter, self._side)
         self._mapper = LocalMapper(camera, self.config, self._map, self._localiser, self._adjuster)
         self._loops = LoopCloser(self.config, self._map, self._localiser)
         self._log = FrameLog(camera, self._map)
@@ -98,6 +100,7 @@ class Tracker:
             self._depth,
             self._shutter,
             self._watch,
+            self._side,
             self._teaching,
         )
         self._motion = Motion()
@@ -151,7 +154,8 @@ class Tracker:
         self._keyframes.count_frame()
         if self._keyframes.is_due:
             self._join(stages=1)
-        self._forget_points()
+        if not self._keyframes.is_adjusting:
+            self._forget_points()
         with self._watch.timed("tracking"):
             features = self._still(frame, plain)
             placement, status = self._finder.place(frame, features)
@@ -193,9 +197,9 @@ class Tracker:
         settled = self._shutter.correct(plain, self._motion.velocity(frame.timestamp_s, T), inverse)
         return settled, self._localiser.settle(settled, placement)
 
-    def _join(self, *, keyframes: int | None = None, stages: int | None = None) -> Moved | None:
+    def _join(self, *, until_born: bool = False, stages: int | None = None) -> Moved | None:
         """Let waiting keyframes have their depth, see ``Keyframes.join``, and follow the map."""
-        moved = self._keyframes.join(keyframes=keyframes, stages=stages)
+        moved = self._keyframes.join(until_born=until_born, stages=stages)
         self._motion.follow(moved)
         return moved
 
@@ -208,7 +212,7 @@ class Tracker:
 
     def _place_again(self, features: Features, placement: Placement) -> Placement:
         """Place a frame in the map that its keyframe's depth has just made larger."""
-        moved = self._join(keyframes=1)
+        moved = self._join(until_born=True)
         assert moved is not None
         rows = self._map.resolve(placement.point_ids)
         carried = Placement(moved.carry(placement.T_camera_world), rows)
@@ -295,4 +299,5 @@ class Tracker:
             if self._teaching:
                 made = self._teaching.predict_anew(made)
             self._depth.close()
+            self._side.close()
             return made

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work that needs nothing but its arguments, done beside the tracker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import ParamSpec, TypeVar
+
+from slamdepth.tracker.threads import one_blas_thread
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+class SideThread:
+    """One thread that computes what is taken later, in the order it was asked for.
+
+    A function given to it must read nothing that the tracker changes meanwhile: then what it returns,
+    taken at a frame that does not depend on how fast it was, is the same on every machine.
+    """
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1, "slamdepth-side")
+
+    def ask(self, function: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
+        """Start ``function``; the result is to be taken with ``result()``, which waits and raises."""
+        return self._pool.submit(_alone, partial(function, *args, **kwargs))
+
+    def close(self) -> None:
+        """End the thread."""
+        self._pool.shutdown(wait=True)
+
+
+def _alone(task: Callable[[], _T]) -> _T:
+    with one_blas_thread():
+        return task()
