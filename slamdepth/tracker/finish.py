@@ -70,7 +70,7 @@ def _adjust_all(
     """Adjust everything, look again for what the better map predicts to be seen, and adjust once more."""
     every = [k.id for k in landmarks.keyframes]
     _follow_motion(frames, shutter)
-    adjuster.adjust(every, [], landmarks.seen_by(2), (5, 8))
+    adjuster.adjust(every, [], landmarks.seen_by(2), (3, 5))
     for n in range(_PASSES):
         before_s = shutter.readout_s
         if shutter.is_sought:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _MIN_OBSERVATIONS = 30
 _READOUT_KEYFRAMES = 20  # among the recent ones, when the readout time is sought on the way
-_READOUT_STEPS = (3, 3)
+_READOUT_STEPS = (2, 2)
 
 
 @dataclass(frozen=True)
