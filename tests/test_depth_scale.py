@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from slamdepth.depth.robust_centre import robust_centre
 from slamdepth.depth.robust_line import robust_line
 from slamdepth.depth.scale import DepthScale, ScaleDomain, ScaleFit, fit_scale
 from slamdepth.depth.scale_file import check_same_model, read_scale, write_scale
@@ -292,3 +293,19 @@ def test_a_scale_of_another_model_or_other_weights_is_refused() -> None:
     retrained.weights = (WeightsInfo("net", "cd" * 32, "rooms", "MIT"),)
     with pytest.raises(ConfigError, match=r"other weights of 'net'.*net, sha256 cdcdcdcdcdcd"):
         check_same_model(made, retrained, "s.yaml")
+
+
+def test_the_robust_centre_bears_outliers_and_varies_less_than_the_median() -> None:
+    rng = np.random.default_rng(0)
+    centres, medians = [], []
+    for _ in range(300):
+        votes = rng.normal(0.2, 0.1, 27)
+        votes[:5] = 3.0
+        centres.append(robust_centre(votes))
+        votes = rng.normal(0.2, 0.1, 27)
+        medians.append((robust_centre(votes), np.median(votes)))
+    assert np.abs(np.array(centres) - 0.2).max() < 0.15
+    of_centre, of_median = np.std(medians, axis=0)
+    assert of_centre < 0.9 * of_median
+    assert robust_centre(np.array([0.7])) == 0.7
+    assert robust_centre(np.linspace(-1.0, 1.0, 5001)) == pytest.approx(0.0, abs=1e-3)

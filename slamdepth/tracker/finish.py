@@ -13,6 +13,7 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.depth.alignment import coarse_correction
+from slamdepth.depth.robust_centre import robust_centre
 from slamdepth.geometry import invert, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.final_keyframe import FinalKeyframe
@@ -80,7 +81,7 @@ def _adjust_all(
             break
         _follow_motion(frames, shutter)
         for keyframe in landmarks.keyframes:
-            mapper.search_neighbours(keyframe, limit=_SEARCHED_AGAIN)
+            mapper.search(keyframe, mapper.neighbours(keyframe, limit=_SEARCHED_AGAIN))
         adjuster.adjust(every, [], landmarks.seen_by(2), (3, 3))
         if is_settled:
             break
@@ -96,7 +97,7 @@ def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> tuple[float, ...]:
     """Scale the map so that it agrees with the depth network over all keyframes, not with any one.
 
     Each keyframe votes with the median log ratio of its map depths to its prediction; the
-    votes' median is taken out. Without votes the scale stays that of the first keyframe.
+    votes' robust centre is taken out. Without votes the scale stays that of the first keyframe.
 
     Returns:
         The votes after that.
@@ -104,7 +105,7 @@ def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> tuple[float, ...]:
     votes = np.array([v for k in landmarks.keyframes if (v := _scale_vote(landmarks, k)) is not None])
     if len(votes) == 0:
         return ()
-    offset = float(np.median(votes))
+    offset = robust_centre(votes)
     factor = float(np.exp(-offset))
     n = landmarks.size
     landmarks.position_w[:n] *= factor

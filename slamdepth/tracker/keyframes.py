@@ -9,14 +9,14 @@ happens depends on the frames alone and not on how fast the network was, so the 
 is the same on every machine.
 
 What follows the depth is spread over several frames, so that none of them takes long. The window is
-adjusted in a thread beside, from a copy, and taken over three frames later.
+adjusted in a thread beside, from a copy, and taken over two frames later.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _MOST_WAITING = 2  # keyframes; with three, points are missed that the oldest would have given birth to
-_ADJUSTED_IN = 2  # frames between those in which the adjustment of a window begins and is taken over
 _WAITED_FOR = 4  # first keyframes whose depth is waited for: all that follows stands on their points
 
 
@@ -56,6 +55,7 @@ class _Waiting:
     frames_left: int
     words: Future[NDArray[np.float32]]
     stages_done: int = 0
+    neighbours: list[int] = field(default_factory=list)
     adjustment: Adjustment | None = None
 
 
@@ -117,7 +117,8 @@ class Keyframes:
         self._readout: Future[BundleResult] | None = None
         self._stages: list[Callable[[_Waiting], Floats | None]] = [
             self._give_birth,
-            *[self._let_adjust] * _ADJUSTED_IN,
+            self._search_on,
+            self._let_adjust,
             self._take_over,
             self._close_loops,
         ]
@@ -207,10 +208,15 @@ class Keyframes:
         with self._timed("mapping"):
             self._follow_motion(keyframe)
             self._mapper.give_birth(keyframe, prediction)
-            self._mapper.search_neighbours(keyframe)
+            waiting.neighbours = self._mapper.neighbours(keyframe)
+            self._mapper.search(keyframe, waiting.neighbours[::2])
         self._rule.points_born()
+
+    def _search_on(self, waiting: _Waiting) -> None:
+        with self._timed("mapping"):
+            self._mapper.search(waiting.keyframe, waiting.neighbours[1::2])
         with self._timed("bundle"):
-            waiting.adjustment = self._mapper.begin_window(keyframe)
+            waiting.adjustment = self._mapper.begin_window(waiting.keyframe)
 
     def _follow_motion(self, keyframe: MapKeyframe) -> None:
         """Use that the frames after the keyframe tell how it moved."""
@@ -250,7 +256,7 @@ class Keyframes:
         if correction is not None:
             self._log.rescale(correction.scales)
             with self._timed("bundle"):
-                self._mapper.search_neighbours(keyframe)
+                self._mapper.search(keyframe, self._mapper.neighbours(keyframe))
                 self._mapper.adjust_window(keyframe)
         with self._timed("mapping"):
             self._mapper.cull(keyframe)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -135,15 +136,18 @@ class LocalMapper:
             prior_offset=float(np.log(self._map.keyframes[keyframe.id - 1].scale)) if keyframe.id else 0.0,
         )
 
-    def search_neighbours(self, keyframe: MapKeyframe, limit: int = 10) -> None:
-        """Find the keyframe's points in the keyframes around it, and merge what is one point.
+    def neighbours(self, keyframe: MapKeyframe, limit: int = 10) -> list[int]:
+        """The keyframes that see most of what ``keyframe`` sees, best first."""
+        own = keyframe.point_ids[keyframe.point_ids >= 0]
+        return [k for k in self._map.covisible(own, limit + 1, minimum=8) if k != keyframe.id]
+
+    def search(self, keyframe: MapKeyframe, neighbours: Iterable[int]) -> None:
+        """Find the keyframe's points in others, and merge what is one point.
 
         For a freshly born point the search area is the stretch of its epipolar line that
         its predicted depth allows; a hit is its first triangulation.
         """
         landmarks = self._map
-        own = keyframe.point_ids[keyframe.point_ids >= 0]
-        neighbours = [k for k in landmarks.covisible(own, limit + 1, minimum=8) if k != keyframe.id]
         for k in neighbours:
             other = landmarks.keyframes[k]
             mine = np.unique(keyframe.point_ids[keyframe.point_ids >= 0])
