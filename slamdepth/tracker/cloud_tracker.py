@@ -18,7 +18,7 @@ from slamdepth.geometry import invert, project, transform
 from slamdepth.mapping.keyframe_store import KeyframeStore
 from slamdepth.tracker.checks import check_frame, model_for
 from slamdepth.tracker.final_keyframe import FinalKeyframe
-from slamdepth.tracker.threads import one_blas_thread
+from slamdepth.tracker.threads import single_threaded
 from slamdepth.types import (
     Camera,
     DepthPrediction,
@@ -98,7 +98,7 @@ class CloudTracker:
         prediction = self._depth_model.predict(frame)
         timings["depth"] = (time.perf_counter() - start) * 1e3
         start = time.perf_counter()
-        with one_blas_thread():
+        with single_threaded():
             cloud = depth_to_cloud(
                 prediction.values,
                 self.camera,

@@ -11,6 +11,7 @@ import numpy as np
 
 from slamdepth.config import FeatureConfig
 from slamdepth.frontend.features import Features, create_extractor
+from slamdepth.tracker.threads import single_threaded
 from slamdepth.types import Camera, Frame
 
 
@@ -41,7 +42,7 @@ class Preparation:
     def __call__(self, frame: Frame) -> Prepared:
         import cv2
 
-        with self._in_use:
+        with self._in_use, single_threaded():
             start = time.perf_counter()
             gray = np.asarray(cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
             features = self._extractor.extract(gray, self._camera)

@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import ParamSpec, TypeVar
 
-from slamdepth.tracker.threads import one_blas_thread
+from slamdepth.tracker.threads import single_threaded
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -34,5 +34,5 @@ class SideThread:
 
 
 def _alone(task: Callable[[], _T]) -> _T:
-    with one_blas_thread():
+    with single_threaded():
         return task()

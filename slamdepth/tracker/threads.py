@@ -12,6 +12,7 @@ from typing import Any
 _lock = threading.Lock()
 _inside = 0
 _limit: Any = None
+_opencv_threads = 1
 
 
 @lru_cache(maxsize=1)
@@ -22,16 +23,21 @@ def _controller() -> Any:
 
 
 @contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Limit NumPy's and SciPy's BLAS to one thread while any thread is inside.
+def single_threaded() -> Iterator[None]:
+    """Limit OpenCV, and NumPy's and SciPy's BLAS, to one thread while any thread is inside.
 
-    For small matrices two spend more time waiting than working, and sums then do not depend
-    on the number of cores. The number is the whole process's, so the last to leave sets it back.
+    For small matrices and images two spend more time waiting than working, all the more where the other
+    core is predicting depth; and sums then do not depend on the number of cores. The number is the
+    whole process's, so the last to leave sets it back.
     """
-    global _inside, _limit
+    import cv2
+
+    global _inside, _limit, _opencv_threads
     with _lock:
         if _inside == 0:
             _limit = _controller().limit(limits=1, user_api="blas")
+            _opencv_threads = cv2.getNumThreads()
+            cv2.setNumThreads(1)
         _inside += 1
     try:
         yield
@@ -40,6 +46,7 @@ def one_blas_thread() -> Iterator[None]:
             _inside -= 1
             if _inside == 0:
                 _limit.restore_original_limits()
+                cv2.setNumThreads(_opencv_threads)
 
 
 def one_thread_here() -> None:

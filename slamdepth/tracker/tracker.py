@@ -33,7 +33,7 @@ from slamdepth.tracker.rescue import CloudRescue
 from slamdepth.tracker.shutter import Shutter
 from slamdepth.tracker.side_thread import SideThread
 from slamdepth.tracker.stopwatch import Stopwatch
-from slamdepth.tracker.threads import one_blas_thread
+from slamdepth.tracker.threads import single_threaded
 from slamdepth.types import (
     Camera,
     DepthPrediction,
@@ -140,7 +140,7 @@ class Tracker:
         """
         check_frame(frame, self.camera, self._motion.last_time_s, self._finished)
         self._watch.next_frame()
-        with one_blas_thread():
+        with single_threaded():
             result = self._step(frame, prepared or self.prepare(frame))
         self._motion.last_time_s = frame.timestamp_s
         return result
@@ -271,7 +271,7 @@ class Tracker:
             raise TrackingError("no frame could be placed: too few features, or no depth")
         self._finished = True
         self._watch.next_frame()
-        with one_blas_thread():
+        with single_threaded():
             self._join()
             if self._teaching:
                 self._teaching.set_back()
