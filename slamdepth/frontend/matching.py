@@ -27,7 +27,7 @@ class PixelGrid:
     """
 
     def __init__(self, px: Floats, cell_px: float = 8.0) -> None:
-        self._px = px
+        self._count = len(px)
         if len(px) == 0:
             return
         self._low = px.min(axis=0)
@@ -36,6 +36,7 @@ class PixelGrid:
         self._columns, self._rows = (int(n) + 1 for n in cell.max(axis=0))
         flat = cell[:, 1] * self._columns + cell[:, 0]
         self._order = np.argsort(flat, kind="stable")
+        self._u, self._v = px[self._order].T.copy()
         counts = np.bincount(flat, minlength=self._columns * self._rows)
         self._starts = np.concatenate([[0], np.cumsum(counts)])
 
@@ -51,7 +52,7 @@ class PixelGrid:
         Returns:
             Two index arrays of equal length, sorted by query.
         """
-        if len(query_px) == 0 or len(self._px) == 0:
+        if len(query_px) == 0 or self._count == 0:
             empty = np.zeros(0, dtype=np.int64)
             return empty, empty
         # of each query: the columns and rows of cells that its circle may touch
@@ -66,11 +67,11 @@ class PixelGrid:
         row = (first[query, 1] + offset) * self._columns
         begin, end = self._starts[row + first[query, 0]], self._starts[row + last[query, 0] + 1]
         run, offset = _expand(end - begin)
-        target = self._order[begin[run] + offset]
-        query = query[run]
-        du, dv = (query_px[query] - self._px[target]).T
-        near = np.flatnonzero(du * du + dv * dv <= radius_px[query] ** 2)
-        return query[near], target[near]
+        at, query = begin[run] + offset, query[run]
+        u, v = query_px.T.copy()
+        du, dv = u[query] - self._u[at], v[query] - self._v[at]
+        near = np.flatnonzero(du * du + dv * dv <= (radius_px * radius_px)[query])
+        return query[near], self._order[at[near]]
 
 
 def _expand(lengths: Ints) -> tuple[Ints, Ints]:

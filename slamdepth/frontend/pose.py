@@ -195,26 +195,20 @@ class _Matches:
         camera = self.camera
         x, y = points_c[:2]
         z = np.maximum(points_c[2], _NEAREST_M)
-        ru, rv = self.residual(points_c, whitening)
-        n = len(z)
-        # the two whitened rows of the derivative by the point, side by side
-        J = np.empty((6, 2 * n))
-        fx_z, fy_z = camera.fx / z, camera.fy / z
-        J[0, :n], J[1, :n] = whitening[0] * fx_z, 0.0
-        J[0, n:], J[1, n:] = whitening[1] * fx_z, whitening[2] * fy_z
-        J[2, :n] = -J[0, :n] * (x / z)
-        J[2, n:] = -J[0, n:] * (x / z) - J[1, n:] * (y / z)
-        xx, yy, zz = np.concatenate([x, x]), np.concatenate([y, y]), np.concatenate([z, z])
+        r = np.stack(self.residual(points_c, whitening))
+        # the two whitened rows of the derivative by the point
+        J = np.empty((6, 2, len(z)))
+        J[0] = whitening[:2] * (camera.fx / z)
+        J[1, 0], J[1, 1] = 0.0, whitening[2] * (camera.fy / z)
+        J[2] = J[0] * (-x / z) - J[1] * (y / z)
         # d(omega x p)/d omega = -[p]_x
-        J[3] = J[2] * yy - J[1] * zz
-        J[4] = J[0] * zz - J[2] * xx
-        J[5] = J[1] * xx - J[0] * yy
-        r = np.concatenate([ru, rv])
+        J[3] = J[2] * y - J[1] * z
+        J[4] = J[0] * z - J[2] * x
+        J[5] = J[1] * x - J[0] * y
         Jw = J
         if robust:
-            weight = HUBER / np.maximum(np.sqrt(ru * ru + rv * rv), HUBER)
-            Jw = J * np.concatenate([weight, weight])
-        return Jw @ J.T, Jw @ r
+            Jw = J * (HUBER / np.maximum(np.sqrt((r * r).sum(axis=0)), HUBER))
+        return Jw.reshape(6, -1) @ J.reshape(6, -1).T, Jw.reshape(6, -1) @ r.ravel()
 
 
 def pose_from_scratch(

@@ -116,25 +116,24 @@ class Localiser:
         Returns:
             ``(map rows, feature indices, descriptor distances)``, one to one.
         """
-        octave_scale = self._levels.sigma_px(visible.octave)
-        S = visible.covariance_px
-        half_trace = 0.5 * (S[:, 0, 0] + S[:, 1, 1])
-        largest = half_trace + np.sqrt(
-            np.maximum(half_trace**2 - (S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2), 0.0)
+        pose_px = radius_px * self._levels.sigma_px(visible.octave)
+        S00, S01, S11 = (visible.covariance_px[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        half_trace = 0.5 * (S00 + S11)
+        largest = half_trace + np.sqrt(np.maximum(half_trace**2 - (S00 * S11 - S01**2), 0.0))
+        reach = np.minimum(pose_px + sigmas * np.sqrt(largest), max_px)
+        # the ellipse of the pose's error plus the point's own, a du^2 + b du dv + c dv^2 < 1
+        along_u, along_v = S00 + pose_px**2 / MAHALANOBIS_GATE, S11 + pose_px**2 / MAHALANOBIS_GATE
+        a, b, c = np.stack([along_v, -2.0 * S01, along_u]) / (
+            MAHALANOBIS_GATE * (along_u * along_v - S01 * S01)
         )
-        reach = np.minimum(radius_px * octave_scale + sigmas * np.sqrt(largest), max_px)
-        # the box around the ellipse below, which along a short epipolar line is much narrower
-        box = np.sqrt(MAHALANOBIS_GATE * S[:, (0, 1), (0, 1)] + ((radius_px * octave_scale) ** 2)[:, None])
+        box = np.sqrt(MAHALANOBIS_GATE * np.column_stack([along_u, along_v]))
         q, t = features.grid.pairs_within(visible.px, reach, box)
         step = features.octave[t] - visible.octave[q]
         ok = (step >= -1) & (step <= 1)
         q, t = q[ok], t[ok]
-        # the ellipse: the pose's error plus the point's own
-        base = (radius_px * octave_scale[q]) ** 2 / MAHALANOBIS_GATE
-        a, b, c = S[q, 0, 0] + base, S[q, 0, 1], S[q, 1, 1] + base
-        d = features.px[t] - visible.px[q]
-        square = (c * d[:, 0] ** 2 - 2 * b * d[:, 0] * d[:, 1] + a * d[:, 1] ** 2) / (a * c - b * b)
-        ok = square < MAHALANOBIS_GATE
+        du = features.px[:, 0][t] - visible.px[:, 0][q]
+        dv = features.px[:, 1][t] - visible.px[:, 1][q]
+        ok = (a[q] * du + b[q] * dv) * du + c[q] * dv * dv < 1.0
         q, t = q[ok], t[ok]
         metric = features.metric
         distance = metric.between(self._map.descriptor[visible.rows[q]], features.descriptors[t])
