@@ -5,18 +5,25 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from tracking_scene import CAMERA, CONFIG, COUNT, ConstantDepth, Run, ate_m, colour_only, frames
 
+from slamdepth.backend.bundle import BundleResult
 from slamdepth.config import Config
 from slamdepth.errors import CameraError
-from slamdepth.geometry import so3_exp
+from slamdepth.geometry import invert, se3_exp, so3_exp, transform
 from slamdepth.mapping.landmarks import MapKeyframe
-from slamdepth.tracker import Tracker
+from slamdepth.tracker import Tracker, side_thread
 from slamdepth.tracker.keyframes import Moved
+from slamdepth.tracker.threads import single_threaded
 from slamdepth.types import DepthPrediction, Frame, Reconstruction, TrackingStatus
 
 
@@ -56,6 +63,66 @@ def test_a_slow_network_changes_nothing(seed: int) -> None:
     for one, other in zip(run.results, slow.results, strict=True):
         np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
         assert one.is_keyframe == other.is_keyframe
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slow_work_beside_changes_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Adjustments, readout times and words are taken at frames that do not depend on their speed."""
+    _, expected = prompt()
+    random, at_once, names = np.random.default_rng(seed), side_thread._alone, set()
+
+    def late(task: Callable[[], Any]) -> Any:
+        names.add(threading.current_thread().name)
+        time.sleep(random.uniform(0.0, 0.2))
+        return at_once(task)
+
+    monkeypatch.setattr(side_thread, "_alone", late)
+    made = Run(frames(change=colour_only), LateDepth(0, 0.0)).finish()
+    assert names == {"slamdepth-side_0"}
+    np.testing.assert_array_equal(made.trajectory.T_world_camera, expected.trajectory.T_world_camera)
+    np.testing.assert_array_equal(made.points_m, expected.points_m)
+
+
+def test_a_keyframe_made_while_a_window_is_adjusted_moves_along() -> None:
+    run = Run(frames(range(60), colour_only), LateDepth(0, 0.0))
+    landmarks, adjuster, mapper = run.tracker._map, run.tracker._adjuster, run.tracker._mapper
+    run.tracker._join()
+    newest = landmarks.keyframes[-1]
+    adjustment = mapper.begin_window(newest)
+    assert adjustment is not None
+    solved = adjustment.result.result()
+    T_made = se3_exp(np.array([0.1, 0.0, 0.0, 0.0, 0.05, 0.0])) @ newest.T_camera_world
+    points = newest.point_ids.copy()
+    made = mapper.insert(newest.frame, newest.features, T_made, points, np.zeros(6))
+    T_made_newest = T_made @ newest.T_world_camera
+    shift = se3_exp(np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.03]))
+    moved = solved.T_camera_world @ shift
+    done: Future[BundleResult] = Future()
+    done.set_result(replace(solved, T_camera_world=moved, points_w=transform(invert(shift), solved.points_w)))
+    before = newest.T_camera_world.copy()
+    adjuster.complete(replace(adjustment, result=done))
+    assert np.abs(newest.T_camera_world - before).max() > 0.01
+    np.testing.assert_allclose(made.T_camera_world @ newest.T_world_camera, T_made_newest, atol=1e-12)
+
+
+def test_the_number_of_threads_is_set_back_by_the_last_to_leave() -> None:
+    cv2.setNumThreads(2)
+    inside, leave = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with single_threaded():
+            inside.set()
+            leave.wait(10.0)
+
+    thread = threading.Thread(target=other)
+    with single_threaded():
+        thread.start()
+        assert inside.wait(10.0)
+        assert cv2.getNumThreads() == 1
+    assert cv2.getNumThreads() == 1
+    leave.set()
+    thread.join()
+    assert cv2.getNumThreads() == 2
 
 
 def test_frames_prepared_ahead_change_nothing() -> None:
