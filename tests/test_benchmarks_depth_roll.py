@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a rolled camera costs: the roll of true poses, and an image turned and its prediction turned back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.depth_roll import TurnedUpright, main, roll_rad, true_roll
+from slamdepth.geometry import se3_exp
+from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Trajectory
+
+CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+UP = np.array([0.0, 0.0, 1.0])
+# looking along the world's y: right is x, down is -z
+T_WORLD_LEVEL = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+def rolled(angle_rad: float, tilt_rad: float = 0.0) -> np.ndarray:
+    tilt = se3_exp(np.array([0, 0, 0, tilt_rad, 0, 0]))
+    return T_WORLD_LEVEL @ tilt @ se3_exp(np.array([0, 0, 0, 0, 0, angle_rad]))
+
+
+class Brightness:
+    """Predicts how bright a pixel is, so that a prediction shows how the image was turned."""
+
+    name, kind, weights = "brightness", DepthKind.METRIC, ()
+
+    def __init__(self) -> None:
+        self.seen: list[np.ndarray] = []
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        self.seen.append(frame.image_rgb)
+        values = 1.0 + frame.image_rgb[..., 0].astype(np.float32)
+        return DepthPrediction(values, self.kind, np.full_like(values, 0.1))
+
+
+def ramp_as_taken(angle_rad: float) -> np.ndarray:
+    """A scene that gets brighter downwards, by a camera rolled by ``angle_rad``."""
+    v, u = np.mgrid[:120, :160]
+    down = np.array([np.sin(angle_rad), np.cos(angle_rad)])
+    height = (u - CAMERA.cx) * down[0] + (v - CAMERA.cy) * down[1]
+    return np.repeat(np.clip(128 + 0.8 * height, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize("angle", [-1.0, 0.0, 0.4])
+@pytest.mark.parametrize("tilt", [0.0, -0.5])
+def test_the_roll_of_a_pose_is_that_of_down_in_the_image(angle: float, tilt: float) -> None:
+    assert roll_rad(rolled(angle, tilt), UP) == pytest.approx(angle, abs=1e-9)
+
+
+@pytest.mark.parametrize("angle", [-0.6, 0.35])
+def test_an_image_is_shown_upright_and_its_depth_comes_back_as_taken(angle: float) -> None:
+    model = Brightness()
+    frame = Frame(0, 0.0, ramp_as_taken(angle), CAMERA)
+    made = TurnedUpright(model, lambda _: angle).predict(frame)
+    upright = model.seen[1][40:80, 50:110, 0].astype(float)
+    assert np.ptp(upright, axis=1).max() <= 2  # rows are level now
+    assert (np.diff(upright.mean(axis=1)) > 0.5).all()
+    np.testing.assert_allclose(made.values, model.predict(frame).values, atol=2.5)
+    assert made.sigma_log is not None
+    assert (made.sigma_log == np.float32(0.1)).all()
+
+
+def test_a_frame_without_a_pose_near_in_time_is_left_as_it_is() -> None:
+    truth = Trajectory(np.array([0.0, 1.0]), np.stack([rolled(0.3), rolled(-0.2)]))
+    roll = true_roll(truth, UP)
+    frame = Frame(0, 0.98, ramp_as_taken(0.0), CAMERA)
+    assert roll(frame) == pytest.approx(-0.2)
+    assert roll(replace(frame, timestamp_s=0.5)) is None
+    model = Brightness()
+    TurnedUpright(model, roll).predict(replace(frame, timestamp_s=0.5))
+    assert len(model.seen) == 1
+
+
+def test_a_sequence_without_poses_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rgb").mkdir()
+    cv2.imwrite(str(tmp_path / "rgb" / "0.png"), np.zeros((48, 64, 3), np.uint8))
+    (tmp_path / "rgb.txt").write_text("0.0 rgb/0.png\n")
+    (tmp_path / "camera.yaml").write_text("width: 64\nheight: 48\nfx: 60\nfy: 60\ncx: 31.5\ncy: 23.5\n")
+    code = main([str(tmp_path)])
+    printed = capsys.readouterr().err
+    assert code != 0
+    assert printed.startswith("error:")
+    assert printed.count("\n") == 1
