@@ -182,3 +182,30 @@ def test_a_jump_is_not_tracked_as_motion() -> None:
     run = Run(frames([*range(20), *range(40, COUNT)]))
     assert all(r.T_world_camera is not None for r in run.results)
     assert ate_m(run.finish().trajectory) < 0.015
+
+
+class SometimesSenseless(ConstantDepth):
+    """Every fourth prediction is hills and holes that are not there; it is as sure of them as of the rest."""
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        plain = super().predict(frame)
+        if self.calls % 4:
+            return plain
+        noise = np.random.default_rng(self.calls).normal(size=(9, 12)).astype(np.float32)
+        hills = cv2.resize(noise, plain.values.shape[::-1], interpolation=cv2.INTER_CUBIC)
+        return replace(plain, values=plain.values * np.exp(1.6 * hills))
+
+
+def test_whole_predictions_that_disagree_with_the_map_are_dropped() -> None:
+    model = SometimesSenseless(sigma_log=0.3)
+    run = Run(frames(change=colour_only), model)
+    made = run.finish()
+    assert run.statuses() == {TRACKING: COUNT}
+    empty = [keyframe.id for keyframe in made.keyframes if not keyframe.prediction.values.any()]
+    assert empty  # not the fourth keyframe: the map knows too little by then
+    assert all(id % 4 == 3 for id in empty)
+    assert any(f"{len(empty)} predicted depth maps disagreed" in note for note in made.notes)
+    assert not any(made.keyframes[k].depth_m.any() for k in empty)
+    assert ate_m(made.trajectory, with_scale=True) < 0.02
+    honest = Run(frames(change=colour_only), ConstantDepth(sigma_log=0.3)).finish()
+    assert all(keyframe.prediction.values.any() for keyframe in honest.keyframes)

@@ -59,6 +59,8 @@ def optimise_everything(
             f"the final adjustment of the whole map was left out: {len(keyframes)} keyframes, "
             f"at most {_MAX_KEYFRAMES} fit"
         )
+    if mapper.dropped:
+        notes.append(f"{mapper.dropped} predicted depth maps disagreed with the map and were not used")
     prediction = keyframes[0].prediction
     if prediction is not None and not prediction.is_sensor:
         votes = _make_metric(landmarks, frames)

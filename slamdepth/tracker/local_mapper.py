@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -32,8 +33,20 @@ if TYPE_CHECKING:
 _LOCAL_STEPS = (3, 3)
 
 
+_NEAREST_M = 0.05
+_JUDGES = 50  # well-known points that it takes to judge a prediction
+_WELL_KNOWN = 0.1  # relative deviation of a point's distance
+_DISAGREES = 2.0  # times the scatter that a prediction says of itself
+
+log = logging.getLogger(__name__)
+
+
 class LocalMapper:
-    """Grows and refines a :class:`LandmarkMap`, one keyframe at a time."""
+    """Grows and refines a :class:`LandmarkMap`, one keyframe at a time.
+
+    Attributes:
+        dropped: predictions that disagreed with the map.
+    """
 
     def __init__(
         self,
@@ -48,6 +61,7 @@ class LocalMapper:
         self._map = landmarks
         self._localiser = localiser
         self._adjuster = adjuster
+        self.dropped = 0
 
     def insert(
         self,
@@ -73,8 +87,8 @@ class LocalMapper:
 
     def count_births(self, features: Features, prediction: DepthPrediction) -> int:
         """How many points a first keyframe would give birth to."""
-        log, sigma = log_depth_at(prediction, features.raw_px)
-        return int(np.count_nonzero(self._may_be_born(log, sigma)))
+        depth, sigma = log_depth_at(prediction, features.raw_px)
+        return int(np.count_nonzero(self._may_be_born(depth, sigma)))
 
     def _may_be_born(self, log_depth: Floats, sigma_log: Floats) -> NDArray[np.bool_]:
         """Where a depth is known, in range, and sure enough by the model's own word."""
@@ -83,7 +97,14 @@ class LocalMapper:
         return in_range & (sigma_log < config.max_sigma_log)
 
     def give_birth(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
-        """Give a keyframe its depth, and birth to the points it sees anew."""
+        """Give a keyframe its depth, and birth to the points it sees anew.
+
+        A prediction that disagrees with the map as a whole is dropped: the keyframe has no depth then.
+        """
+        if not prediction.is_sensor and not self._agrees(keyframe, prediction):
+            log.warning("keyframe %d: its predicted depth disagrees with the map; not used", keyframe.id)
+            prediction = replace(prediction, values=np.zeros_like(prediction.values))
+            self.dropped += 1
         keyframe.prediction = _compact(prediction)
         features = keyframe.features
         depth, sigma = log_depth_at(prediction, features.raw_px)
@@ -91,13 +112,13 @@ class LocalMapper:
         if prediction.is_sensor:
             keyframe.log_depth, keyframe.sigma_log = depth, sigma
         else:
-            log, doubt = prior_log_depth_at(prediction, features.raw_px)
+            prior, doubt = prior_log_depth_at(prediction, features.raw_px)
             keyframe.predicted_log_depth = depth
             correction, sigma = self.depth_field(keyframe, keyframe.prediction).correction(
-                features.raw_px, np.nan_to_num(log), np.nan_to_num(doubt, nan=1.0)
+                features.raw_px, np.nan_to_num(prior), np.nan_to_num(doubt, nan=1.0)
             )
             keyframe.scale = float(np.exp(np.median(correction)))
-            depth = log + correction
+            depth = prior + correction
         born = np.flatnonzero((keyframe.point_ids < 0) & sure & self._may_be_born(depth, sigma))
         if not prediction.is_sensor:
             keyframe.log_depth[born] = depth[born]
@@ -110,6 +131,30 @@ class LocalMapper:
         R = T_world_camera[:3, :3]
         self._map.add_points(keyframe, born, transform(T_world_camera, position_c), R @ covariance_c @ R.T)
 
+    def _agrees(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> bool:
+        """Whether a prediction scatters about the well-known points as it says of itself, or nearly so.
+
+        Its scale is left out: that is an error that tracking estimates.
+        """
+        at, rows, z = self._seen_points(keyframe, observations=3)
+        predicted, sigma = log_depth_at(prediction, keyframe.features.raw_px[at])
+        ratio = np.log(z) - predicted
+        ratio = ratio[self._map.sigma_along_ray(rows, keyframe.center_w) < _WELL_KNOWN]
+        ratio = ratio[np.isfinite(ratio)]
+        if len(ratio) < _JUDGES:
+            return True
+        scatter = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
+        return scatter < _DISAGREES * float(np.median(sigma))
+
+    def _seen_points(self, keyframe: MapKeyframe, observations: int) -> tuple[Ints, Ints, Floats]:
+        """Features, rows and depths in the camera of points that so many keyframes see."""
+        at = np.flatnonzero(keyframe.point_ids >= 0)
+        at = at[self._map.observations[keyframe.point_ids[at]] >= observations]
+        rows = keyframe.point_ids[at]
+        z = transform(keyframe.T_camera_world, self._map.position_w[rows])[:, 2]
+        ok = z > _NEAREST_M
+        return at[ok], rows[ok], z[ok]
+
     def predict_anew(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
         """Exchange a keyframe's prediction for another; its points stay."""
         keyframe.prediction = _compact(prediction)
@@ -117,13 +162,7 @@ class LocalMapper:
 
     def depth_field(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> DepthField:
         """The keyframe's ``prediction`` tied to the well-known points it sees."""
-        seen = np.flatnonzero(keyframe.point_ids >= 0)
-        rows = keyframe.point_ids[seen]
-        multi = self._map.observations[rows] >= 2
-        seen, rows = seen[multi], rows[multi]
-        z = transform(keyframe.T_camera_world, self._map.position_w[rows])[:, 2]
-        ok = z > 0.05
-        seen, rows, z = seen[ok], rows[ok], z[ok]
+        seen, rows, z = self._seen_points(keyframe, observations=2)
         raw = keyframe.features.raw_px[seen]
         log_predicted, sigma = prior_log_depth_at(prediction, raw)
         return fit_depth_field(
