@@ -207,14 +207,12 @@ class LandmarkMap:
                 continue
             taken = np.zeros(self.size + 1, dtype=bool)
             taken[ids] = True
-            for feature in moved:
-                winner = target[ids[feature]]
-                if taken[winner]:
-                    ids[feature] = -1
-                else:
-                    taken[winner] = True
-                    ids[feature] = winner
-                    self.observations[winner] += 1
+            winner = target[ids[moved]]
+            keeps = np.zeros(len(moved), dtype=bool)
+            keeps[np.unique(winner, return_index=True)[1]] = True  # of several the first
+            keeps &= ~taken[winner]
+            ids[moved] = np.where(keeps, winner, -1)
+            self.observations[winner[keeps]] += 1
         self.alive[losers] = False
         self.alias[losers] = winners
         np.add.at(self.visible, winners, self.visible[losers])
