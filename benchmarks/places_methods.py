@@ -135,7 +135,8 @@ def verified(places: Sequence[Place], camera: Camera, config: Config, min_gap: i
     closer = LoopCloser(config, landmarks, Localiser(camera, config, landmarks))
     for k, place in enumerate(places):
         _add(landmarks, camera, config, k, place)
-        closer.add(landmarks.keyframes[k])
+        keyframe = landmarks.keyframes[k]
+        closer.add(keyframe, closer.describe(keyframe.features))
 
     def answer(query: int, earlier: Sequence[int]) -> Answers:
         keyframe = landmarks.keyframes[query]
