@@ -17,6 +17,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
@@ -83,11 +84,7 @@ class TurnedUpright:
 
 def turned(image_rgb: NDArray[np.uint8], camera: Camera, angle_rad: float) -> NDArray[np.uint8]:
     """An image turned about its principal point, its border mirrored."""
-    import cv2
-
-    size = (image_rgb.shape[1], image_rgb.shape[0])
-    M = cv2.getRotationMatrix2D((camera.cx, camera.cy), np.degrees(angle_rad), 1.0)
-    out = cv2.warpAffine(image_rgb, M, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    out = _warped(image_rgb, camera, angle_rad, cv2.INTER_LINEAR, cv2.BORDER_REFLECT_101)
     return np.asarray(out, dtype=np.uint8)
 
 
@@ -95,12 +92,15 @@ def turned_back(
     values: NDArray[np.float32], otherwise: NDArray[np.float32], camera: Camera, angle_rad: float
 ) -> NDArray[np.float32]:
     """A map of a turned image for the image as taken, ``otherwise`` where that was cut off."""
-    import cv2
-
-    size = (values.shape[1], values.shape[0])
-    M = cv2.getRotationMatrix2D((camera.cx, camera.cy), np.degrees(angle_rad), 1.0)
-    out = cv2.warpAffine(values, M, size, flags=cv2.INTER_NEAREST, borderValue=-1.0)
+    out = _warped(values, camera, angle_rad, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
     return np.where(out > 0, out, otherwise).astype(np.float32)
+
+
+def _warped(
+    image: NDArray[Any], camera: Camera, angle_rad: float, interpolation: int, border: int
+) -> NDArray[Any]:
+    M = cv2.getRotationMatrix2D((camera.cx, camera.cy), np.degrees(angle_rad), 1.0)
+    return np.asarray(cv2.warpAffine(image, M, image.shape[1::-1], flags=interpolation, borderMode=border))
 
 
 def judged(
@@ -115,7 +115,8 @@ def judged(
         raise DatasetError(f"{dataset.path}: has no ground truth to tell the roll by; leave it out")
     place = SequencePlace.of(dataset)
     upright = TurnedUpright(model, true_roll(dataset.ground_truth, up_w))
-    return [judge_depth(m, readable(place, thinned(place, stride))) for m in (model, upright)]
+    chosen = thinned(place, stride)
+    return [judge_depth(m, readable(place, chosen)) for m in (model, upright)]
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

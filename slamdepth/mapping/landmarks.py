@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slamdepth.geometry import invert
+from slamdepth.geometry import invert, transform
 from slamdepth.types import DepthPrediction, Frame
 
 if TYPE_CHECKING:
@@ -61,6 +61,7 @@ class MapKeyframe:
 
 
 _LEAST_ROWS = 4096
+_NEAREST_M = 0.05
 
 
 class LandmarkMap:
@@ -258,6 +259,15 @@ class LandmarkMap:
             mask[self.keyframes[k].point_ids] = True
         mask[-1] = False
         return np.flatnonzero(mask[: self.size] & self.alive[: self.size])
+
+    def depths_seen(self, keyframe: MapKeyframe, observations: int) -> tuple[Ints, Ints, Floats]:
+        """Features of ``keyframe``, rows and depths in it, of points before it that so many keyframes see."""
+        at = np.flatnonzero(keyframe.point_ids >= 0)
+        at = at[self.observations[keyframe.point_ids[at]] >= observations]
+        rows = keyframe.point_ids[at]
+        z = transform(keyframe.T_camera_world, self.position_w[rows])[:, 2]
+        ok = z > _NEAREST_M
+        return at[ok], rows[ok], z[ok]
 
     def seen_by(self, keyframes: int) -> Ints:
         """Rows of the living points that at least so many keyframes see."""

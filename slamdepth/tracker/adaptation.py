@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.depth.adaptation import TaughtView
-from slamdepth.geometry import transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.local_mapper import LocalMapper
@@ -30,7 +29,6 @@ _MIN_OBSERVATIONS = 3
 _MAX_SIGMA_LOG = 0.05
 _MAX_POINTS = 200  # a view
 _HELD_OUT_OF = 5  # one point of so many, in all views that see it, is judged by and never learnt from
-_MIN_DEPTH_M = 0.05
 
 
 class MapTeaching:
@@ -81,12 +79,8 @@ class MapTeaching:
         return [self._view(keyframe) for keyframe in self._map.keyframes[:count]]
 
     def _view(self, keyframe: MapKeyframe) -> TaughtView:
-        at = np.flatnonzero(keyframe.point_ids >= 0)
-        rows = keyframe.point_ids[at]
-        z = transform(keyframe.T_camera_world, self._map.position_w[rows])[:, 2]
-        good = (self._map.observations[rows] >= _MIN_OBSERVATIONS) & (z > _MIN_DEPTH_M)
-        good &= self._map.sigma_along_ray(rows, keyframe.center_w) < _MAX_SIGMA_LOG
-        chosen = np.flatnonzero(good)
+        at, rows, z = self._map.depths_seen(keyframe, _MIN_OBSERVATIONS)
+        chosen = np.flatnonzero(self._map.sigma_along_ray(rows, keyframe.center_w) < _MAX_SIGMA_LOG)
         chosen = chosen[:: max(1, len(chosen) // _MAX_POINTS)]
         return TaughtView(
             keyframe.frame,

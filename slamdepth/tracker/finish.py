@@ -14,7 +14,7 @@ import numpy as np
 from slamdepth.config import Config
 from slamdepth.depth.alignment import coarse_correction
 from slamdepth.depth.robust_centre import robust_centre
-from slamdepth.geometry import invert, transform
+from slamdepth.geometry import invert
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.final_keyframe import FinalKeyframe
 from slamdepth.tracker.frame_log import FrameLog
@@ -123,12 +123,9 @@ def _make_metric(landmarks: LandmarkMap, frames: FrameLog) -> tuple[float, ...]:
 
 
 def _scale_vote(landmarks: LandmarkMap, keyframe: MapKeyframe) -> float | None:
-    at = np.flatnonzero(keyframe.point_ids >= 0)
-    rows = keyframe.point_ids[at]
-    at, rows = at[landmarks.observations[rows] >= 3], rows[landmarks.observations[rows] >= 3]
-    z = transform(keyframe.T_camera_world, landmarks.position_w[rows])[:, 2]
+    at, _, z = landmarks.depths_seen(keyframe, observations=3)
     predicted = keyframe.predicted_log_depth[at]
-    ok = (z > 0.05) & np.isfinite(predicted)
+    ok = np.isfinite(predicted)
     if np.count_nonzero(ok) < 20:
         return None
     return float(np.median(np.log(z[ok]) - predicted[ok]))

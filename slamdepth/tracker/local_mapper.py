@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 _LOCAL_STEPS = (3, 3)
 
 
-_NEAREST_M = 0.05
 _JUDGES = 50  # well-known points that it takes to judge a prediction
 _WELL_KNOWN = 0.1  # relative deviation of a point's distance
 _DISAGREES = 2.0  # times the scatter that a prediction says of itself
@@ -136,7 +135,7 @@ class LocalMapper:
 
         Its scale is left out: that is an error that tracking estimates.
         """
-        at, rows, z = self._seen_points(keyframe, observations=3)
+        at, rows, z = self._map.depths_seen(keyframe, observations=3)
         predicted, sigma = log_depth_at(prediction, keyframe.features.raw_px[at])
         ratio = np.log(z) - predicted
         ratio = ratio[self._map.sigma_along_ray(rows, keyframe.center_w) < _WELL_KNOWN]
@@ -146,15 +145,6 @@ class LocalMapper:
         scatter = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
         return scatter < _DISAGREES * float(np.median(sigma))
 
-    def _seen_points(self, keyframe: MapKeyframe, observations: int) -> tuple[Ints, Ints, Floats]:
-        """Features, rows and depths in the camera of points that so many keyframes see."""
-        at = np.flatnonzero(keyframe.point_ids >= 0)
-        at = at[self._map.observations[keyframe.point_ids[at]] >= observations]
-        rows = keyframe.point_ids[at]
-        z = transform(keyframe.T_camera_world, self._map.position_w[rows])[:, 2]
-        ok = z > _NEAREST_M
-        return at[ok], rows[ok], z[ok]
-
     def predict_anew(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
         """Exchange a keyframe's prediction for another; its points stay."""
         keyframe.prediction = _compact(prediction)
@@ -162,7 +152,7 @@ class LocalMapper:
 
     def depth_field(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> DepthField:
         """The keyframe's ``prediction`` tied to the well-known points it sees."""
-        seen, rows, z = self._seen_points(keyframe, observations=2)
+        seen, rows, z = self._map.depths_seen(keyframe, observations=2)
         raw = keyframe.features.raw_px[seen]
         log_predicted, sigma = prior_log_depth_at(prediction, raw)
         return fit_depth_field(

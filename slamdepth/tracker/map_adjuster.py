@@ -59,22 +59,15 @@ class MapAdjuster:
         self._shutter = shutter
         self._side = side
 
-    def adjust(
-        self, window: list[int], fixed: list[int], rows: Ints, iterations: tuple[int, ...]
-    ) -> BundleResult | None:
+    def adjust(self, window: list[int], fixed: list[int], rows: Ints, iterations: tuple[int, ...]) -> None:
         """Adjust the keyframes ``window``, held by ``fixed``, over the points ``rows``.
 
-        The map is changed: poses, points, and observations that do not agree are forgotten.
-
-        Returns:
-            What came out; None where there is too little to adjust.
+        The map is changed: poses, points, and observations that do not agree are forgotten. Nothing
+        happens where there is too little to adjust.
         """
         part = self._part(window, fixed, rows)
-        if part is None:
-            return None
-        result = bundle_adjust(part.problem, iterations)
-        self._take_over(part, result)
-        return result
+        if part is not None:
+            self._take_over(part, bundle_adjust(part.problem, iterations))
 
     def begin(
         self, window: list[int], fixed: list[int], rows: Ints, iterations: tuple[int, ...]
