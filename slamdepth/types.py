@@ -305,7 +305,7 @@ class Reconstruction:
         frames, tracked, loop_closures, relocalisations, rescues: counts over the run.
         timings_ms: mean milliseconds per call of each stage.
         scale_votes: log ratio of the map's depths to the predicted ones, one for each
-            keyframe that could tell; the map's scale is where their median is 0. Empty
+            keyframe that could tell; the map's scale is where their robust centre is 0. Empty
             where nothing was voted on, as with a sensor.
         readout_s: seconds the camera took from an image's first row to its last, as the
             trajectory was made with; 0 for a global shutter, None where it plays no part.

@@ -126,7 +126,7 @@ def _own_sentence(before: PredictionScale, votes: int, spread: float | None, sig
         return f"metric, {before.how}"
     agreed = ""
     if spread is not None:
-        agreed = f", the median over {votes} keyframes (their log ratios spread by {spread:.2f})"
+        agreed = f", the robust centre over {votes} keyframes (their log ratios spread by {spread:.2f})"
     sure = f"true metres within about {100 * sigma_log:.0f} %"
     if before.source is ScaleSource.VALUE:
         sure = "how true it is nobody measured"
