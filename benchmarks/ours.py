@@ -9,7 +9,7 @@ from slamdepth.depth.registry import create_depth_model
 from slamdepth.pipeline.results import keyframe_trajectory
 from slamdepth.pipeline.run import seed_everything, seed_torch
 from slamdepth.tracker import create_tracker
-from slamdepth.types import Camera, Frame, Reconstruction
+from slamdepth.types import Camera, Frame
 
 
 class SlamDepth:
@@ -30,13 +30,9 @@ class SlamDepth:
     def step(self, frame: Frame) -> None:
         self._tracker.step(frame)
 
-    def reconstruction(self) -> Reconstruction:
-        """All that the tracker has to hand over; errors as ``Tracker.finish``."""
-        return self._tracker.finish()
-
     def finish(self) -> Estimate:
         """The reconstruction's poses; errors as ``Tracker.finish``."""
-        done = self.reconstruction()
+        done = self._tracker.finish()
         counts = {
             "keyframes": len(done.keyframes),
             "loops": done.loop_closures,

@@ -105,7 +105,6 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "prior inflation 20": {"bundle": {"prior_inflation": 20.0}},
     "no common depth error": {"bundle": {"scale_sigma": 0.0}},
     "any depth, however unsure": {"depth": {"max_sigma_log": 10.0}},
-    "depth head adapted": {"depth": {"adapt": True}},
     "500 features": {"features": {"count": 500}},
     "1000 features": {"features": {"count": 1000}},
     "2000 features": {"features": {"count": 2000}},

@@ -102,7 +102,6 @@ class DepthConfig(_Section):
     max_sigma_log: float = Field(
         1.0, gt=0, description="pixels whose log depth is less sure than this never become map points"
     )
-    adapt: bool = Field(False, description="let the map's points teach the depth model while it runs")
 
 
 GROUND_TRUTH = "groundtruth"

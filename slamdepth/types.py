@@ -275,26 +275,6 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
-class Adaptation:
-    """How far a depth model has learnt from the map; see ``slamdepth.depth.adaptation``.
-
-    Attributes:
-        updates: times it learnt. views: keyframes it learnt from.
-        judged_views: keyframes whose held-out points judged it before it learnt from them.
-        loss_before, loss_after: mean Huber loss of log depth over those, as trained and with
-            what was learnt by then; None before any was judged.
-        in_use: True where predictions use what was learnt; not unless that lowered the loss.
-    """
-
-    updates: int = 0
-    views: int = 0
-    judged_views: int = 0
-    loss_before: float | None = None
-    loss_after: float | None = None
-    in_use: bool = False
-
-
-@dataclass(frozen=True)
 class Reconstruction:
     """What ``Tracker.finish`` returns.
 
@@ -310,7 +290,6 @@ class Reconstruction:
         readout_s: seconds the camera took from an image's first row to its last, as the
             trajectory was made with; 0 for a global shutter, None where it plays no part.
         readout_sigma_s: its deviation where it was found out, None where it was given.
-        adaptation: what the depth model learnt from the map; None where it was not to.
     """
 
     trajectory: Trajectory
@@ -326,4 +305,3 @@ class Reconstruction:
     scale_votes: tuple[float, ...] = ()
     readout_s: float | None = None
     readout_sigma_s: float | None = None
-    adaptation: Adaptation | None = None

@@ -49,14 +49,6 @@ def run_command(
             "sequence's ground truth says.",
         ),
     ] = None,
-    adapt: Annotated[
-        bool,
-        typer.Option(
-            "--adapt",
-            help="Experimental: let the map's points teach the depth model (dinov2) while it runs; measured: "
-            "no gain on fr1_desk and fr1_rpy, see docs/depth.md. Example: slamdepth run SEQ --adapt",
-        ),
-    ] = False,
     camera_height: Annotated[
         float | None, typer.Option(metavar="M", help="First camera's height over the floor in metres.")
     ] = None,
@@ -134,7 +126,7 @@ def run_command(
                 "weights": _text(features_weights),
                 "matcher": _text(features_matcher),
             },
-            "depth": {"name": depth, "weights": _text(depth_weights), "adapt": adapt or None},
+            "depth": {"name": depth, "weights": _text(depth_weights)},
             "scale": {
                 "depth": depth_scale,
                 "camera_height_m": camera_height,

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,9 +17,6 @@ from slamdepth.depth.preprocess import check_size, focal_factor, input_size, nor
 from slamdepth.depth.registry import register
 from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
-
-if TYPE_CHECKING:
-    from slamdepth.depth.adapting import AdaptingDinov2
 
 
 class Dinov2Depth:
@@ -123,12 +119,6 @@ class Dinov2Depth:
         """Mean log canonical depth ``(H/7, W/7)`` of the heads before they are upsampled."""
         with torch.inference_mode():
             return self._head.coarse_log_depth(features)[0]
-
-    def adapting(self) -> AdaptingDinov2:
-        """This model while it learns from a map; this one itself stays as it is."""
-        from slamdepth.depth.adapting import AdaptingDinov2
-
-        return AdaptingDinov2(self)
 
 
 @register("dinov2")

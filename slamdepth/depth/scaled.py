@@ -3,16 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from slamdepth.depth.adaptation import AdaptingDepthModel, TaughtView, adapting
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.scale import DepthScale, ScaleDomain, needs_shift
 from slamdepth.errors import ConfigError
-from slamdepth.types import Adaptation, DepthKind, DepthPrediction, Frame
+from slamdepth.types import DepthKind, DepthPrediction, Frame
 
 
 class ScaledDepth:
@@ -45,23 +43,9 @@ class ScaledDepth:
         self.scale = scale
         self._model = model
 
-    def adapting(self) -> AdaptingScaledDepth:
-        """The model of its own that learns, scaled the same way.
-
-        Raises:
-            ConfigError: it cannot learn, or the scale has a shift.
-        """
-        if self.scale.shift != 0.0:
-            raise ConfigError(
-                "a depth scale with a shift and --adapt (depth.adapt) exclude each other; leave out one"
-            )
-        return AdaptingScaledDepth(adapting(self._model), self.scale)
-
     def predict(self, frame: Frame) -> DepthPrediction:
         """Metres ``(H, W)`` and, where the model says how sure it is, that carried along."""
-        return self._scaled(self._model.predict(frame))
-
-    def _scaled(self, prediction: DepthPrediction) -> DepthPrediction:
+        prediction = self._model.predict(frame)
         depth_m = self.scale.depth_m(prediction.values)
         sigma_log = prediction.sigma_log
         if sigma_log is not None and self.scale.shift != 0.0:
@@ -70,19 +54,3 @@ class ScaledDepth:
             line = np.where(depth_m > 0, scaled + np.float32(self.scale.shift), np.float32(1.0))
             sigma_log = (sigma_log * np.abs(scaled / line)).astype(np.float32)
         return replace(prediction, values=depth_m, kind=self.kind, sigma_log=sigma_log)
-
-
-class AdaptingScaledDepth(ScaledDepth):
-    """A scaled model that learns: a factor is common to a view, so it changes nothing of what is learnt."""
-
-    def __init__(self, model: AdaptingDepthModel, scale: DepthScale) -> None:
-        super().__init__(model, scale)
-        self._learner = model
-
-    def predict_as_trained(self, frame: Frame) -> DepthPrediction:
-        """As the model that is scaled, in metres."""
-        return self._scaled(self._learner.predict_as_trained(frame))
-
-    def adapt(self, views: Sequence[TaughtView]) -> Adaptation:
-        """As the model that is scaled."""
-        return self._learner.adapt(views)

@@ -33,7 +33,6 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         "timings_ms": dict(run.timings_ms),
         **_trajectory(data.trajectory_score),
         "depth": _depth(data.depth_score),
-        "adaptation": None if run.adaptation is None else asdict(run.adaptation),
         "mesh": {
             "vertices": data.mesh.vertices if data.mesh else None,
             "triangles": data.mesh.triangles if data.mesh else None,

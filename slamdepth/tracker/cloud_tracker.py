@@ -12,7 +12,7 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
-from slamdepth.errors import ConfigError, TrackingError
+from slamdepth.errors import TrackingError
 from slamdepth.frontend.registration import CloudOdometry, CloudOdometryConfig, depth_to_cloud
 from slamdepth.geometry import invert, project, transform
 from slamdepth.mapping.keyframe_store import KeyframeStore
@@ -63,11 +63,6 @@ class CloudTracker:
     ) -> None:
         self.camera = camera
         self.config = config or Config()
-        if self.config.depth.adapt:
-            raise ConfigError(
-                "--adapt (depth.adapt) learns from the map points of --odometry orb; kiss-icp has none: "
-                "leave out one of the two"
-            )
         self._depth_model = model_for(depth_model, self.config)
         reach = CloudOdometryConfig(
             min_m=max(self.config.depth.min_m, 0.2), max_m=min(self.config.depth.max_m, 5.0)

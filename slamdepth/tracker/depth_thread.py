@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
-from slamdepth.depth.adaptation import AdaptingDepthModel, TaughtView
 from slamdepth.depth.base import DepthModel
 from slamdepth.tracker.threads import one_thread_here
-from slamdepth.types import Adaptation, DepthPrediction, Frame
+from slamdepth.types import DepthPrediction, Frame
 
 
 class DepthThread:
@@ -49,18 +47,6 @@ class DepthThread:
             self._taken = (frame, self._asked[n][1].result())
             del self._asked[n]
         return self._taken[1]
-
-    def again(self, frame: Frame, *, as_trained: bool = False) -> DepthPrediction:
-        """The prediction of a model that learns for a frame asked for long ago: with what it has learnt
-        since, or without any of it."""
-        assert isinstance(self._model, AdaptingDepthModel)
-        predict = self._model.predict_as_trained if as_trained else self._model.predict
-        return self._pool.submit(predict, frame).result()
-
-    def adapt(self, views: Sequence[TaughtView]) -> Future[Adaptation]:
-        """Let a model that learns do so: after all predictions asked for, before those to come."""
-        assert isinstance(self._model, AdaptingDepthModel)
-        return self._pool.submit(self._model.adapt, views)
 
     def close(self) -> None:
         """End the thread."""

@@ -21,7 +21,7 @@ from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.map_adjuster import MapAdjuster
 from slamdepth.tracker.shutter import Shutter
-from slamdepth.types import Adaptation, Keyframe, Reconstruction
+from slamdepth.types import Keyframe, Reconstruction
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -145,7 +145,6 @@ def build_reconstruction(
     timings_ms: dict[str, float],
     notes: list[str],
     scale_votes: tuple[float, ...] = (),
-    adaptation: Adaptation | None = None,
 ) -> Reconstruction:
     """The value handed to the user, with every frame placed anew where ``refine_frames``."""
     # NumPy and the disk work in other threads while this one places frames
@@ -168,7 +167,6 @@ def build_reconstruction(
         scale_votes=scale_votes,
         readout_s=shutter.readout_s,
         readout_sigma_s=shutter.sigma_s,
-        adaptation=adaptation,
     )
 
 

@@ -27,7 +27,6 @@ from slamdepth.frontend.features import Features
 from slamdepth.geometry import orthonormalised
 from slamdepth.mapping.keyframe_store import KeyframeStore
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
-from slamdepth.tracker.adaptation import MapTeaching
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.keyframe_rule import KeyframeRule
@@ -80,7 +79,6 @@ class Keyframes:
 
     Args:
         watch: measures the stages.
-        teaching: told of every keyframe that has joined; None where the depth model learns nothing.
 
     Attributes:
         store: where their images lie.
@@ -98,7 +96,6 @@ class Keyframes:
         shutter: Shutter,
         watch: Stopwatch,
         side: SideThread,
-        teaching: MapTeaching | None = None,
     ) -> None:
         self._config = config
         self._map = landmarks
@@ -111,7 +108,6 @@ class Keyframes:
         self._timed = watch.timed
         self.store = KeyframeStore(config.map.keyframe_memory_mib)
         self._side = side
-        self._teaching = teaching
         self._rule = KeyframeRule(config, landmarks)
         self._waiting: list[_Waiting] = []  # oldest first
         self._readout: Future[BundleResult] | None = None
@@ -261,7 +257,4 @@ class Keyframes:
         with self._timed("mapping"):
             self._mapper.cull(keyframe)
             self.store.tidy(self._map.keyframes)
-        if self._teaching is not None:
-            with self._timed("teaching"):
-                self._teaching.keyframe_joined(keyframe.id + 1)
         return None if correction is None else correction.scales

@@ -145,11 +145,6 @@ class LocalMapper:
         scatter = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
         return scatter < _DISAGREES * float(np.median(sigma))
 
-    def predict_anew(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
-        """Exchange a keyframe's prediction for another; its points stay."""
-        keyframe.prediction = _compact(prediction)
-        keyframe.predicted_log_depth, _ = log_depth_at(prediction, keyframe.features.raw_px)
-
     def depth_field(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> DepthField:
         """The keyframe's ``prediction`` tied to the well-known points it sees."""
         seen, rows, z = self._map.depths_seen(keyframe, observations=2)

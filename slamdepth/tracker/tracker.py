@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.config import Config
-from slamdepth.depth.adaptation import adapting
 from slamdepth.depth.base import DepthModel
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import invert
 from slamdepth.mapping.landmarks import LandmarkMap
-from slamdepth.tracker.adaptation import MapTeaching, in_words
 from slamdepth.tracker.checks import check_frame, model_for
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.finder import Finder
@@ -76,8 +74,7 @@ class Tracker:
     ) -> None:
         self.camera = camera
         self.config = config or Config()
-        model = model_for(depth_model, self.config)
-        self._depth = DepthThread(adapting(model) if self.config.depth.adapt else model)
+        self._depth = DepthThread(model_for(depth_model, self.config))
         self._preparation = Preparation(camera, self.config.features)
         self._watch = Stopwatch()
         self._map = LandmarkMap()
@@ -88,8 +85,6 @@ class Tracker:
         self._mapper = LocalMapper(camera, self.config, self._map, self._localiser, self._adjuster)
         self._loops = LoopCloser(self.config, self._map, self._localiser)
         self._log = FrameLog(camera, self._map)
-        adapt = self.config.depth.adapt
-        self._teaching = MapTeaching(self._map, self._mapper, self._depth) if adapt else None
         self._keyframes = Keyframes(
             self.config,
             self._map,
@@ -101,7 +96,6 @@ class Tracker:
             self._shutter,
             self._watch,
             self._side,
-            self._teaching,
         )
         self._motion = Motion()
         self._finder = Finder(
@@ -273,14 +267,10 @@ class Tracker:
         self._watch.next_frame()
         with single_threaded():
             self._join()
-            if self._teaching:
-                self._teaching.set_back()
             with self._watch.timed("final"):
                 notes, votes = optimise_everything(
                     self._map, self._mapper, self._adjuster, self._log, self._shutter, self.config
                 )
-            learnt = self._teaching.finish() if self._teaching else None
-            notes += [in_words(learnt)] if learnt else []
             made = build_reconstruction(
                 self._map,
                 self._mapper,
@@ -294,10 +284,7 @@ class Tracker:
                 timings_ms=self._watch.mean_ms(),
                 notes=notes,
                 scale_votes=votes,
-                adaptation=learnt,
             )
-            if self._teaching:
-                made = self._teaching.predict_anew(made)
             self._depth.close()
             self._side.close()
             return made
