@@ -235,11 +235,9 @@ def test_levels_are_averaged_too_and_come_back_from_the_file(tmp_path: Path) -> 
     loaded, _ = load_head(tmp_path / "h.safetensors")
     args = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56)
     with torch.inference_mode():
-        features = loaded.features(*args)
-        coarse = loaded.coarse_log_depth(features)
         outs = [member(*args) for member in loaded.members]
-        log_depth, _ = loaded.decode(features)
-    assert float(coarse.mean()) == pytest.approx(math.log(2.0), abs=1e-3)
+        log_depth, _ = loaded(*args)
+    assert float(log_depth.mean()) == pytest.approx(math.log(2.0), abs=1e-3)
     torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
 
 

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import cast
 
@@ -59,35 +58,6 @@ class HeadShape:
     input_px: int = 238 * 322
 
 
-@dataclass(frozen=True)
-class HeadFeatures:
-    """All that is left to decode.
-
-    Attributes:
-        seen: ``(members, B, guide_dim, H/7, W/7)`` what each member's last layers read.
-        doubt: ``(B, H/7, W/7)`` log spread common to the members; None where each has its own.
-        level: ``(members, B)`` mean log depth of a view; None where the last layers tell it.
-    """
-
-    seen: Tensor
-    doubt: Tensor | None = None
-    level: Tensor | None = None
-
-
-@dataclass(frozen=True)
-class LastLayerChange:
-    """How log depth differs from what was trained.
-
-    Attributes:
-        weights: ``(members, guide_dim)`` added to those of the last layer; what that does to an
-            image's mean log depth is taken out again.
-        offset: added to log depth everywhere.
-    """
-
-    weights: Tensor
-    offset: float = 0.0
-
-
 class DepthHead(nn.Module):
     """One head. ``dropout`` works in training only.
 
@@ -112,8 +82,8 @@ class DepthHead(nn.Module):
         nn.init.normal_(self.out.weight, std=1e-3)
         self.out.bias = nn.Parameter(torch.tensor([math.log(USUAL_DEPTH_M), math.log(0.3)]))
 
-    def see(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What the last layers read ``(B, guide_dim, H/7, W/7)``, and the level ``(B,)`` if told apart."""
+    def coarse(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Log depth and log spread ``(B, 2, H/7, W/7)``, and what the upsampling needs."""
         x, cls = tokens.flatten(1, 2), class_tokens.flatten(1)
         level = None
         if self.level is not None:
@@ -127,20 +97,12 @@ class DepthHead(nn.Module):
         for block in self.blocks:
             x = block(x)
         x = F.interpolate(self.narrow(x), scale_factor=2, mode="bilinear", align_corners=False)
-        return self.mix(F.gelu(x + self.guide(F.pixel_unshuffle(image, FACTOR)))), level
-
-    def tell(self, seen: Tensor, level: Tensor | None) -> Tensor:
-        """Log depth and log spread ``(B, 2, H/7, W/7)`` from what :meth:`see` gives."""
-        out: Tensor = self.out(seen)
-        if level is None:
-            return out
-        log_depth = out[:, :1] - out[:, :1].mean(dim=(2, 3), keepdim=True) + level[:, None, None, None]
-        return torch.cat([log_depth, out[:, 1:]], dim=1)
-
-    def coarse(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Log depth and log spread ``(B, 2, H/7, W/7)``, and what the upsampling needs."""
-        seen, level = self.see(tokens, class_tokens, image)
-        return self.tell(seen, level), seen
+        features = self.mix(F.gelu(x + self.guide(F.pixel_unshuffle(image, FACTOR))))
+        out: Tensor = self.out(features)
+        if level is not None:
+            log_depth = out[:, :1] - out[:, :1].mean(dim=(2, 3), keepdim=True) + level[:, None, None, None]
+            out = torch.cat([log_depth, out[:, 1:]], dim=1)
+        return out, features
 
     def forward(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> Tensor:
         """Predict from ``tokens (B, taps, dim, H/14, W/14)``, ``class_tokens (B, taps, dim)``
@@ -151,26 +113,6 @@ class DepthHead(nn.Module):
         """
         coarse, features = self.coarse(tokens, class_tokens, image)
         return convex_upsample(coarse, self.weights(features))
-
-    def decode(
-        self,
-        seen: Tensor,
-        level: Tensor | None,
-        doubt: Tensor | None = None,
-        change: Tensor | None = None,
-    ) -> Tensor:
-        """What :meth:`forward` gives, from what :meth:`see` gives.
-
-        Args:
-            doubt: ``(B, H/7, W/7)`` log spread to take instead of its own.
-            change: ``(guide_dim,)`` weights for log depth; what they say is a third channel.
-        """
-        coarse = self.tell(seen, level)
-        if doubt is not None:
-            coarse = torch.stack([coarse[:, 0], doubt], dim=1)
-        if change is not None:
-            coarse = torch.cat([coarse, torch.einsum("c,bchw->bhw", change, seen)[:, None]], dim=1)
-        return convex_upsample(coarse, self.weights(seen))
 
 
 class HeadEnsemble(nn.Module):
@@ -194,46 +136,18 @@ class HeadEnsemble(nn.Module):
 
     def forward(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
         """Mean log depth and its calibrated standard deviation, each ``(B, H, W)``."""
-        return self.decode(self.features(tokens, class_tokens, image))
-
-    @property
-    def _heads(self) -> Sequence[DepthHead]:
-        return cast("Sequence[DepthHead]", self.members)
-
-    def features(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> HeadFeatures:
-        """What the members' last layers read, and the common doubt where there is one."""
-        each = [member.see(tokens, class_tokens, image) for member in self._heads]
-        levels = [level for _, level in each if level is not None]
-        features = HeadFeatures(
-            torch.stack([seen for seen, _ in each]), level=torch.stack(levels) if levels else None
-        )
-        if self.doubt is None:
-            return features
-        return replace(features, doubt=self.doubt(tokens[:, -1], self.coarse_log_depth(features)))
-
-    def decode(self, features: HeadFeatures, change: LastLayerChange | None = None) -> tuple[Tensor, Tensor]:
-        """What :meth:`forward` gives, from :meth:`features`."""
-        changes = [None] * len(self.members) if change is None else change.weights
+        members = cast("list[DepthHead]", list(self.members))
+        told = [member.coarse(tokens, class_tokens, image) for member in members]
+        if self.doubt is not None:
+            log_depth = torch.stack([coarse[:, 0] for coarse, _ in told]).mean(dim=0)
+            doubt = self.doubt(tokens[:, -1], log_depth)
+            told = [(torch.stack([coarse[:, 0], doubt], dim=1), features) for coarse, features in told]
         outs = torch.stack([
-            member.decode(seen, level, features.doubt, own)
-            for member, seen, level, own in zip(
-                self._heads, features.seen, self._levels(features), changes, strict=True
-            )
+            convex_upsample(coarse, member.weights(features))
+            for member, (coarse, features) in zip(members, told, strict=True)
         ])  # fmt: skip
-        mean = outs[:, :, 0].mean(dim=0)
-        if change is not None:
-            relief = outs[:, :, 2].mean(dim=0)
-            mean = mean + relief - relief.mean(dim=(1, 2), keepdim=True) + change.offset
         # A Laplace distribution of spread b has the variance 2 b^2.
-        return mean, self.sigma_scale * math.sqrt(2.0) * outs[:, :, 1].mean(dim=0).exp()
-
-    def coarse_log_depth(self, features: HeadFeatures) -> Tensor:
-        """Mean log depth ``(B, H/7, W/7)`` of the members before the upsampling."""
-        each = zip(self._heads, features.seen, self._levels(features), strict=True)
-        return torch.stack([member.tell(seen, level)[:, 0] for member, seen, level in each]).mean(dim=0)
-
-    def _levels(self, features: HeadFeatures) -> Sequence[Tensor | None]:
-        return [None] * len(self.members) if features.level is None else list(features.level)
+        return outs[:, :, 0].mean(dim=0), self.sigma_scale * math.sqrt(2.0) * outs[:, :, 1].mean(dim=0).exp()
 
 
 def save_head(path: Path, model: HeadEnsemble, about: dict[str, str]) -> None:

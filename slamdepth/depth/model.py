@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
-from slamdepth.depth.head import HeadEnsemble, HeadFeatures, LastLayerChange, load_head
+from slamdepth.depth.head import HeadEnsemble, load_head
 from slamdepth.depth.preprocess import check_size, focal_factor, input_size, normalised, resize_rgb
 from slamdepth.depth.registry import register
 from slamdepth.errors import ConfigError
@@ -78,14 +78,6 @@ class Dinov2Depth:
         Raises:
             CameraError: the image is too small or too narrow for the network.
         """
-        return self.decode(self.features(frame), frame)
-
-    def features(self, frame: Frame) -> HeadFeatures:
-        """What the head's last layers read of ``frame``; see :meth:`HeadEnsemble.features`.
-
-        Raises:
-            CameraError: as :meth:`predict`.
-        """
         check_size(frame)
         height, width = frame.image_rgb.shape[:2]
         rows, columns = input_size(height, width, self._head.shape.input_px)
@@ -94,16 +86,7 @@ class Dinov2Depth:
             tapped = self._backbone(image.to(self._dtype), self._head.shape.taps)
             tokens = torch.stack([grid for grid, _ in tapped], dim=1).float()
             class_tokens = torch.stack([token for _, token in tapped], dim=1).float()
-            return self._head.features(tokens, class_tokens, image)
-
-    def decode(
-        self, features: HeadFeatures, frame: Frame, change: LastLayerChange | None = None
-    ) -> DepthPrediction:
-        """The prediction for ``frame`` from its :meth:`features`; see :meth:`HeadEnsemble.decode`."""
-        height, width = frame.image_rgb.shape[:2]
-        rows, columns = input_size(height, width, self._head.shape.input_px)
-        with torch.inference_mode():
-            log_depth, sigma = self._head.decode(features, change)
+            log_depth, sigma = self._head(tokens, class_tokens, image)
             both = torch.stack([log_depth, sigma], dim=1)
             full = F.interpolate(both, size=(height, width), mode="bilinear", align_corners=False)[0]
             log_depth_full = full[0] + math.log(focal_factor(frame.camera, rows, columns))
@@ -114,11 +97,6 @@ class Dinov2Depth:
             self.kind,
             np.ascontiguousarray(sigma_log, dtype=np.float32),
         )
-
-    def coarse_log_depth(self, features: HeadFeatures) -> torch.Tensor:
-        """Mean log canonical depth ``(H/7, W/7)`` of the heads before they are upsampled."""
-        with torch.inference_mode():
-            return self._head.coarse_log_depth(features)[0]
 
 
 @register("dinov2")
