@@ -9,7 +9,7 @@ happens depends on the frames alone and not on how fast the network was, so the 
 is the same on every machine.
 
 What follows the depth is spread over several frames, so that none of them takes long. The window is
-adjusted in a thread beside, from a copy, and taken over two frames later.
+adjusted in a thread beside, from a copy, and taken over two frames later; once more where a loop was closed.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class _Waiting:
     keyframe: MapKeyframe
     frames_left: int
     words: Future[NDArray[np.float32]]
-    stages_done: int = 0
+    stages: list[Callable[[_Waiting], Floats | None]]  # still to come
+    is_born: bool = False
     neighbours: list[int] = field(default_factory=list)
     adjustment: Adjustment | None = None
 
@@ -111,13 +112,6 @@ class Keyframes:
         self._rule = KeyframeRule(config, landmarks)
         self._waiting: list[_Waiting] = []  # oldest first
         self._readout: Future[BundleResult] | None = None
-        self._stages: list[Callable[[_Waiting], Floats | None]] = [
-            self._give_birth,
-            self._search_on,
-            self._let_adjust,
-            self._take_over,
-            self._close_loops,
-        ]
 
     def wants(self, placement: Placement) -> bool:
         """Whether a frame should become a keyframe; see :class:`KeyframeRule`."""
@@ -126,7 +120,7 @@ class Keyframes:
     @property
     def is_full(self) -> bool:
         """Whether one more keyframe has to wait until the oldest has given birth to its points."""
-        return sum(waiting.stages_done == 0 for waiting in self._waiting) >= _MOST_WAITING
+        return sum(not waiting.is_born for waiting in self._waiting) >= _MOST_WAITING
 
     @property
     def is_due(self) -> bool:
@@ -153,7 +147,8 @@ class Keyframes:
         self._rule.keyframe_made()
         delay = 0 if self._depth.is_instant(frame) else self._config.tracking.depth_delay
         words = self._side.ask(self._loops.describe, keyframe.features)
-        self._waiting.append(_Waiting(keyframe, delay, words))
+        stages = [self._give_birth, self._search_on, self._let_adjust, self._take_over, self._close_loops]
+        self._waiting.append(_Waiting(keyframe, delay, words, stages))
         if len(self._map.keyframes) <= _WAITED_FOR:
             self.join()
         return keyframe
@@ -174,14 +169,15 @@ class Keyframes:
             return None
         anchor = self._map.keyframes[-1]
         moved = Moved(anchor, anchor.T_world_camera)
-        left = len(self._stages) * len(self._waiting) if stages is None else stages
-        while self._waiting and left > 0:
+        done = 0
+        while self._waiting and done != stages:
             oldest = self._waiting[0]
+            was_born = oldest.is_born
             scales = self._next_stage(oldest)
             if scales is not None:
                 moved.scale *= float(scales[anchor.id])
-            left -= 1
-            if until_born and oldest.stages_done == 1:
+            done += 1
+            if until_born and oldest.is_born and not was_born:
                 break
         return moved
 
@@ -191,11 +187,10 @@ class Keyframes:
         Returns:
             ``(K,)`` what the metres of each keyframe were multiplied by, where a loop was closed.
         """
-        stage = self._stages[waiting.stages_done]
-        waiting.stages_done += 1
-        if waiting.stages_done == len(self._stages):
+        scales = waiting.stages.pop(0)(waiting)
+        if not waiting.stages:
             del self._waiting[0]
-        return stage(waiting)
+        return scales
 
     def _give_birth(self, waiting: _Waiting) -> None:
         keyframe = waiting.keyframe
@@ -206,6 +201,7 @@ class Keyframes:
             self._mapper.give_birth(keyframe, prediction)
             waiting.neighbours = self._mapper.neighbours(keyframe)
             self._mapper.search(keyframe, waiting.neighbours[::2])
+        waiting.is_born = True
         self._rule.points_born()
 
     def _search_on(self, waiting: _Waiting) -> None:
@@ -249,12 +245,21 @@ class Keyframes:
         with self._timed("loops"):
             self._loops.add(keyframe, waiting.words.result())
             correction = self._loops.close(keyframe)
-        if correction is not None:
-            self._log.rescale(correction.scales)
-            with self._timed("bundle"):
-                self._mapper.search(keyframe, self._mapper.neighbours(keyframe))
-                self._mapper.adjust_window(keyframe)
+        if correction is None:
+            self._tidy(waiting)
+            return None
+        self._log.rescale(correction.scales)
+        waiting.stages += [self._search_anew, self._let_adjust, self._take_over, self._tidy]
+        return correction.scales
+
+    def _search_anew(self, waiting: _Waiting) -> None:
+        """Tie the two sides of a loop together by what both see."""
         with self._timed("mapping"):
-            self._mapper.cull(keyframe)
+            self._mapper.search(waiting.keyframe, self._mapper.neighbours(waiting.keyframe))
+        with self._timed("bundle"):
+            waiting.adjustment = self._mapper.begin_window(waiting.keyframe)
+
+    def _tidy(self, waiting: _Waiting) -> None:
+        with self._timed("mapping"):
+            self._mapper.cull(waiting.keyframe)
             self.store.tidy(self._map.keyframes)
-        return None if correction is None else correction.scales

@@ -197,12 +197,9 @@ class LocalMapper:
         stronger = landmarks.observations[mine] > landmarks.observations[theirs]
         landmarks.merge(np.where(stronger, theirs, mine), np.where(stronger, mine, theirs))
 
-    def adjust_window(self, keyframe: MapKeyframe) -> None:
-        """Local bundle adjustment of the keyframe and those that see most of its points."""
-        self._adjuster.adjust(*self._window(keyframe), _LOCAL_STEPS)
-
     def begin_window(self, keyframe: MapKeyframe) -> Adjustment | None:
-        """The same in the thread beside; see :meth:`MapAdjuster.begin`."""
+        """Local bundle adjustment of the keyframe and those that see most of its points, in the thread
+        beside; see :meth:`MapAdjuster.begin`."""
         return self._adjuster.begin(*self._window(keyframe), _LOCAL_STEPS)
 
     def _window(self, keyframe: MapKeyframe) -> tuple[list[int], list[int], Ints]:
