@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slamdepth.evaluation.bootstrap import block_length, interval, spread
-from slamdepth.evaluation.depth_fit import affine_fit, apply_affine, as_depth
+from slamdepth.evaluation.depth_fit import affine_fit, apply_affine
 from slamdepth.evaluation.depth_maps import depth_ssim, edge_score
+from slamdepth.evaluation.depth_pixels import as_depth
 from slamdepth.types import DepthKind
 
 ALL = np.ones((20, 64), dtype=bool)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made_up import MadeUpDataset, pose
 
-from slamdepth.pipeline.results import judge_depth, judge_trajectory, keyframe_trajectory
+from slamdepth.pipeline.results import judge_trajectory, keyframe_trajectory, score_depth
 from slamdepth.types import DepthKind, DepthPrediction, Keyframe, Reconstruction, Trajectory
 
 
@@ -27,7 +27,7 @@ def keyframe(number: int, scale: float, *, is_sensor: bool = False) -> Keyframe:
 
 
 def test_predicted_depth_is_judged_as_the_model_gave_it() -> None:
-    score = judge_depth(MadeUpDataset(5), tuple(keyframe(i, 1.25) for i in (0, 2, 4)))
+    score = score_depth(MadeUpDataset(5), tuple(keyframe(i, 1.25) for i in (0, 2, 4)))
     assert score is not None
     assert score.frames == 3
     assert score.metric.abs_rel == pytest.approx(0.25, abs=1e-6)
@@ -36,11 +36,11 @@ def test_predicted_depth_is_judged_as_the_model_gave_it() -> None:
 
 
 def test_a_sensor_is_not_judged_against_itself() -> None:
-    assert judge_depth(MadeUpDataset(1), (keyframe(0, 1.0, is_sensor=True),)) is None
+    assert score_depth(MadeUpDataset(1), (keyframe(0, 1.0, is_sensor=True),)) is None
 
 
 def test_keyframes_whose_depth_is_broken_are_left_out() -> None:
-    score = judge_depth(MadeUpDataset(2, broken_depth=(0,)), (keyframe(0, 2.0), keyframe(1, 1.0)))
+    score = score_depth(MadeUpDataset(2, broken_depth=(0,)), (keyframe(0, 2.0), keyframe(1, 1.0)))
     assert score is not None
     assert (score.frames, score.metric.abs_rel) == (1, 0.0)
 

@@ -22,7 +22,7 @@ from rich.console import Console
 
 from slamdepth.config import Config
 from slamdepth.errors import OutputError
-from slamdepth.evaluation import DepthAccumulator, score_trajectory
+from slamdepth.evaluation import DepthScorer, score_trajectory
 from slamdepth.geometry import se3_exp
 from slamdepth.report import (
     MeshCounts,
@@ -93,9 +93,9 @@ def full_data() -> ReportData:
     kept = np.r_[0:30, 40:COUNT]
     estimate = Trajectory(estimate.timestamps_s[kept], estimate.T_world_camera[kept])
     keyframes = tuple(keyframe(i) for i in range(6))
-    accumulator = DepthAccumulator(stride=1)
+    scorer = DepthScorer(stride=1)
     for k in keyframes:
-        accumulator.add(k.depth_m * 1.1, k.frame.depth_m)
+        scorer.add(k.depth_m * 1.1, k.frame.depth_m)
     states = [TrackingStatus.INITIALISING, *[TrackingStatus.TRACKING] * 29, *[TrackingStatus.LOST] * 10]
     states += [TrackingStatus.RELOCALISED, *[TrackingStatus.TRACKING] * 39]
     steps = tuple(
@@ -123,7 +123,7 @@ def full_data() -> ReportData:
         weights=(WeightsInfo("head & backbone", "ab" * 32, "some rooms", "Apache-2.0"),),
         steps=steps,
         trajectory_score=score_trajectory(truth, estimate),
-        depth_score=accumulator.score(),
+        depth_score=scorer.score(),
         mesh=MeshCounts(1234, 5678),
         skipped_frames=2,
         notes=("3 rows dropped",),

@@ -18,6 +18,7 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.depth.robust_line import robust_line
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.evaluation.bootstrap import block_resamples
+from slamdepth.evaluation.depth_pixels import MAX_M, MIN_M, STRIDE
 from slamdepth.types import DepthKind, Frame, WeightsInfo
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-_GRID = 4
-_SENSOR_M = (0.1, 10.0)
 _FEWEST_PIXELS = 50
 _MOST_SAMPLES = 20_000
 _RESAMPLES = 200
@@ -152,13 +151,13 @@ def _samples(model: DepthModel, frames: Iterable[Frame]) -> tuple[list[Floats], 
     """Predicted values and sensor depths in metres of the same pixels, frame by frame."""
     values: list[Floats] = []
     sensor_m: list[Floats] = []
-    grid = slice(_GRID // 2, None, _GRID)
+    grid = slice(STRIDE // 2, None, STRIDE)
     for frame in frames:
         if frame.depth_m is None:
             continue
         value = model.predict(frame).values[grid, grid].ravel().astype(np.float64)
         measured = frame.depth_m[grid, grid].ravel().astype(np.float64)
-        both = (measured >= _SENSOR_M[0]) & (measured <= _SENSOR_M[1])
+        both = (measured >= MIN_M) & (measured <= MAX_M)
         both &= np.isfinite(value) & (value > 0 if model.kind is DepthKind.METRIC else value != 0)
         if np.count_nonzero(both) >= _FEWEST_PIXELS:
             values.append(value[both])

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from slamdepth.evaluation.bootstrap import Interval
-from slamdepth.evaluation.depth import DepthAccumulator, DepthErrors, DepthScore
+from slamdepth.evaluation.depth import DepthErrors, DepthScore, DepthScorer
 from slamdepth.evaluation.depth_judge import DepthJudge, DepthJudgement, mean_over_sets
 from slamdepth.evaluation.trajectory import (
     MAX_DIFFERENCE_S,
@@ -17,11 +17,11 @@ from slamdepth.evaluation.trajectory import (
 __all__ = [
     "MAX_DIFFERENCE_S",
     "AbsoluteError",
-    "DepthAccumulator",
     "DepthErrors",
     "DepthJudge",
     "DepthJudgement",
     "DepthScore",
+    "DepthScorer",
     "Interval",
     "RelativeError",
     "TrajectoryScore",

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Score depth maps against a depth sensor, frame by frame and in bounded memory.
+"""The short score of depth maps beside a sensor's, for the report of a run: errors, scaled three ways.
+
+Frame by frame and in bounded memory; what takes whole maps or says how sure a figure is, is in
+:mod:`slamdepth.evaluation.depth_judge`, of the same pixels and with the same errors.
 
 Each figure is computed inside a frame and then averaged over the frames, so that a frame
 counts the same however many of its pixels the sensor saw. The measures are those of
@@ -13,6 +16,9 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from slamdepth.evaluation.depth_pixels import MAX_M, MIN_M, STRIDE, ComparedPixels
+from slamdepth.types import DepthKind
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -72,7 +78,7 @@ class DepthScore:
         return asdict(self)
 
 
-class DepthAccumulator:
+class DepthScorer:
     """Collects frames and scores them at the end.
 
     The factor of ``sequence_median`` is known only at the end, so samples are kept as
@@ -80,32 +86,32 @@ class DepthAccumulator:
     is dropped and later frames are thinned alike; the other figures use every sample.
 
     Args:
-        min_m, max_m: sensor depths outside are not compared.
-        stride: every ``stride``-th pixel of every ``stride``-th row is compared.
+        min_m, max_m, stride: see :class:`~slamdepth.evaluation.depth_pixels.ComparedPixels`.
         max_samples: upper bound of samples held.
     """
 
     def __init__(
-        self, *, min_m: float = 0.1, max_m: float = 10.0, stride: int = 4, max_samples: int = 4_000_000
+        self,
+        *,
+        min_m: float = MIN_M,
+        max_m: float = MAX_M,
+        stride: int = STRIDE,
+        max_samples: int = 4_000_000,
     ) -> None:
-        if not 0 < min_m < max_m:
-            raise ValueError(f"need 0 < min_m < max_m, got {min_m} and {max_m}")
-        if stride < 1 or max_samples < 1:
-            raise ValueError(f"stride and max_samples must be positive, got {stride} and {max_samples}")
-        self.min_m, self.max_m, self.stride, self.max_samples = min_m, max_m, stride, max_samples
+        if max_samples < 1:
+            raise ValueError(f"max_samples must be positive, got {max_samples}")
+        self.max_samples = max_samples
+        self._compared = ComparedPixels(min_m=min_m, max_m=max_m, stride=stride)
         self._samples: list[tuple[Pixels, Pixels]] = []
         self._held = 0
         self._thinning = 1
         self._metric: list[DepthErrors] = []
         self._frame_median: list[DepthErrors] = []
-        self._log_scales: list[float] = []
-        self._pixels = 0
-        self._sensor_pixels = 0
 
     @property
     def frames(self) -> int:
         """Frames compared so far."""
-        return len(self._metric)
+        return self._compared.frames
 
     def add(self, predicted_m: NDArray[np.floating], sensor_m: NDArray[np.floating]) -> bool:
         """Compare one frame.
@@ -121,31 +127,17 @@ class DepthAccumulator:
         Raises:
             ValueError: the two are not maps of one shape.
         """
-        if predicted_m.ndim != 2 or predicted_m.shape != sensor_m.shape:
-            raise ValueError(
-                "predicted and sensor depth must share one (H, W), "
-                f"got {predicted_m.shape} and {sensor_m.shape}"
-            )
-        grid = slice(self.stride // 2, None, self.stride)
-        predicted = np.asarray(predicted_m[grid, grid], dtype=np.float32).ravel()
-        sensor = np.asarray(sensor_m[grid, grid], dtype=np.float32).ravel()
-        measured = (sensor >= self.min_m) & (sensor <= self.max_m)
-        both = measured & np.isfinite(predicted) & (predicted > 0)
-        self._sensor_pixels += int(measured.sum())
-        if not both.any():
+        found = self._compared.take(predicted_m, sensor_m, DepthKind.METRIC)
+        if found is None:
             return False
-        predicted, sensor = predicted[both], sensor[both]
-        scale = float(np.median(sensor / predicted))
-        self._metric.append(depth_errors(predicted, sensor))
-        self._frame_median.append(depth_errors(predicted * np.float32(scale), sensor))
-        self._log_scales.append(float(np.log(scale)))
-        self._pixels += len(predicted)
-        self._keep(predicted, sensor)
+        self._metric.append(depth_errors(found.depth, found.sensor_m))
+        self._frame_median.append(depth_errors(found.depth * found.factor, found.sensor_m))
+        self._keep(found.depth.astype(np.float32), found.sensor_m.astype(np.float32))
         return True
 
     def score(self) -> DepthScore | None:
         """The figures over all frames added, or None where none could be compared."""
-        if not self._metric:
+        if not self.frames:
             return None
         ratios = np.concatenate([sensor / predicted for predicted, sensor in self._samples])
         scale = float(np.median(ratios))
@@ -155,10 +147,10 @@ class DepthAccumulator:
             sequence_median=_mean(scaled),
             frame_median=_mean(self._frame_median),
             sequence_scale=scale,
-            frame_scale_spread=float(np.std(self._log_scales)),
+            frame_scale_spread=float(np.std(self._compared.log_factors)),
             frames=self.frames,
-            pixels=self._pixels,
-            coverage=self._pixels / self._sensor_pixels,
+            pixels=self._compared.pixels,
+            coverage=self._compared.coverage,
         )
 
     def _keep(self, predicted: Pixels, sensor: Pixels) -> None:

@@ -7,24 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth.evaluation.depth_pixels import MAX_M, MIN_M, ComparedPixels, as_depth
 from slamdepth.types import DepthKind
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Values = NDArray[np.floating]
-
-
-def as_depth(values: Values, kind: DepthKind) -> NDArray[np.float64]:
-    """Values of ``kind`` as depth up to a factor; 0 where there is none.
-
-    Inverse depth is inverted as if its shift were 0. What is 0, negative or not finite is
-    no prediction.
-    """
-    values = np.asarray(values, dtype=np.float64)
-    known = np.isfinite(values) & (values > 0)
-    safe = np.where(known, values, 1.0)
-    return np.where(known, 1.0 / safe if kind is DepthKind.AFFINE_INVERSE_DEPTH else safe, 0.0)
 
 
 def fits_in(kind: DepthKind) -> str:
@@ -39,7 +28,7 @@ def affine_fit(depth: Values, sensor_m: Values, kind: DepthKind) -> tuple[float,
     2022) do; every pixel weighs the same. A prediction without relief gets the factor 0.
 
     Args:
-        depth: ``(N,)`` of :func:`as_depth`, positive.
+        depth: ``(N,)`` of :func:`~slamdepth.evaluation.depth_pixels.as_depth`, positive.
         sensor_m: ``(N,)``, positive.
     """
     x, y = (_linear(a, kind) for a in (depth, sensor_m))
@@ -68,15 +57,14 @@ def _linear(depth: Values, kind: DepthKind) -> NDArray[np.float64]:
     return np.asarray(1.0 / depth if kind is DepthKind.AFFINE_INVERSE_DEPTH else depth, dtype=np.float64)
 
 
-def fitted_to_sensor(
-    values: Values, kind: DepthKind, sensor_m: Values, min_m: float = 0.1, max_m: float = 10.0
-) -> NDArray[np.float64]:
+def fitted_to_sensor(values: Values, kind: DepthKind, sensor_m: Values) -> NDArray[np.float64]:
     """One frame's prediction in metres, to look at: after the median, or the affine fit where
     its numbers are no metres. ``(H, W)``, 0 where there is none."""
     depth = as_depth(values, kind)
-    both = (depth > 0) & (sensor_m >= min_m) & (sensor_m <= max_m)
-    if not both.any():
+    compared = ComparedPixels(stride=1).take(values, sensor_m, kind)
+    if compared is None:
         return depth
     if kind is DepthKind.METRIC:
-        return np.asarray(depth * np.median(sensor_m[both] / depth[both]), dtype=np.float64)
-    return apply_affine(depth, affine_fit(depth[both], sensor_m[both], kind), kind, min_m, max_m)
+        return depth * compared.factor
+    fit = affine_fit(compared.depth, compared.sensor_m, kind)
+    return apply_affine(depth, fit, kind, MIN_M, MAX_M)

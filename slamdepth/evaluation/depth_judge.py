@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything that is said of predicted depth beside a sensor's: scaled four ways, with intervals."""
+"""The long judgement of a depth model beside a sensor, for ``eval-depth``: scaled four ways, with intervals.
+
+Edges, structure and the affine fit need whole maps, intervals every frame's figures; a run's report
+does without, see :mod:`slamdepth.evaluation.depth`. Pixels and errors are the same there.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,9 @@ import numpy as np
 
 from slamdepth.evaluation.bootstrap import Interval, interval, spread
 from slamdepth.evaluation.depth import depth_errors
-from slamdepth.evaluation.depth_fit import affine_fit, apply_affine, as_depth, fits_in
+from slamdepth.evaluation.depth_fit import affine_fit, apply_affine, fits_in
 from slamdepth.evaluation.depth_maps import EdgeScore, depth_ssim, edge_score
+from slamdepth.evaluation.depth_pixels import MAX_M, MIN_M, STRIDE, ComparedPixels, FramePixels, as_depth
 from slamdepth.types import DepthKind, DepthPrediction
 
 if TYPE_CHECKING:
@@ -109,25 +114,23 @@ class DepthJudge:
 
     Args:
         kind: what the predictions' numbers mean.
-        min_m, max_m: sensor depths outside are not compared.
-        stride: errors are of every ``stride``-th pixel of every ``stride``-th row; SSIM and
-            edges are of all.
+        min_m, max_m, stride: see :class:`~slamdepth.evaluation.depth_pixels.ComparedPixels`;
+            SSIM and edges are of all pixels, whatever the stride.
     """
 
-    def __init__(self, kind: DepthKind, *, min_m: float = 0.1, max_m: float = 10.0, stride: int = 4) -> None:
-        if not 0 < min_m < max_m or stride < 1:
-            raise ValueError(f"need 0 < min_m < max_m and stride > 0, got {min_m}, {max_m}, {stride}")
-        self.kind, self.min_m, self.max_m = kind, min_m, max_m
-        self._grid = (slice(stride // 2, None, stride),) * 2
+    def __init__(
+        self, kind: DepthKind, *, min_m: float = MIN_M, max_m: float = MAX_M, stride: int = STRIDE
+    ) -> None:
+        self.kind = kind
+        self._compared = ComparedPixels(min_m=min_m, max_m=max_m, stride=stride)
         self._waiting: IO[bytes] = tempfile.SpooledTemporaryFile(max_size=_IN_MEMORY_BYTES)  # noqa: SIM115
         self._ratios: list[NDArray[np.float32]] = []
-        self._scores: list[dict[str, float]] = []
-        self._sensor_pixels = 0
+        self._uncertainties: list[dict[str, float]] = []
 
     @property
     def frames(self) -> int:
         """Frames compared so far."""
-        return len(self._ratios)
+        return self._compared.frames
 
     def add(self, prediction: DepthPrediction, sensor_m: NDArray[np.floating]) -> bool:
         """Take in one frame.
@@ -144,47 +147,34 @@ class DepthJudge:
         """
         if prediction.kind is not self.kind:
             raise ValueError(f"a judge of {self.kind.value} was given {prediction.kind.value}")
-        if sensor_m.ndim != 2 or prediction.values.shape != sensor_m.shape:
-            raise ValueError(
-                f"depth of shapes {prediction.values.shape} and {sensor_m.shape}; need one (H, W)"
-            )
-        depth = as_depth(prediction.values, self.kind)
-        sensor = np.where((sensor_m >= self.min_m) & (sensor_m <= self.max_m), sensor_m, 0.0)
-        d, s = depth[self._grid].ravel(), sensor[self._grid].ravel()
-        both = (d > 0) & (s > 0)
-        self._sensor_pixels += int((s > 0).sum())
-        if not both.any():
+        found = self._compared.take(prediction.values, sensor_m, self.kind)
+        if found is None:
             return False
-        d, s = d[both], s[both]
-        self._ratios.append((s / d).astype(np.float32))
-        sigma = None if prediction.sigma_log is None else prediction.sigma_log[self._grid].ravel()[both]
-        self._scores.append({
-            "log_factor": float(np.log(np.median(s / d))),
-            **_uncertainty(d, s, sigma, self.kind is DepthKind.METRIC),
-        })  # fmt: skip
-        for array in (depth.astype(np.float32), sensor.astype(np.float32)):
-            np.save(self._waiting, array)
+        self._ratios.append(found.ratios.astype(np.float32))
+        self._uncertainties.append(_uncertainty(found, prediction.sigma_log, self.kind is DepthKind.METRIC))
+        for array in (as_depth(prediction.values, self.kind), self._compared.in_range(sensor_m)):
+            np.save(self._waiting, array.astype(np.float32))
         return True
 
     def judge(self) -> DepthJudgement | None:
         """The figures over all frames added, or None where none could be compared."""
-        if not self._ratios:
+        if not self.frames:
             return None
         factor = float(np.median(np.concatenate(self._ratios)))
         ways = WAYS if self.kind is DepthKind.METRIC else WAYS[1:]
         rows: list[dict[str, float]] = []
-        bins = _Bins(self.min_m, self.max_m, ways)
+        bins = _Bins(self._compared.min_m, self._compared.max_m, ways)
         self._waiting.seek(0)
-        for score in self._scores:
+        for log_factor, uncertainty in zip(self._compared.log_factors, self._uncertainties, strict=True):
             depth, sensor = (np.load(self._waiting).astype(np.float64) for _ in range(2))
-            row = dict(score)
+            row = {"log_factor": log_factor, **uncertainty}
             edges: EdgeScore | None = None
-            for way, scaled in self._scaled(depth, sensor, factor, score["log_factor"]):
+            for way, scaled in self._scaled(depth, sensor, factor, log_factor):
                 if edges is None or way == "frame_affine":  # a factor alone moves no edge
                     edges = edge_score(scaled, sensor, (scaled > 0) & (sensor > 0)) or _NO_EDGES
                 figures = self._figures(scaled, sensor, edges)
                 row.update({f"{way}.{name}": value for name, value in figures.items()})
-                bins.add(way, scaled[self._grid], sensor[self._grid])
+                bins.add(way, scaled[self._compared.grid], sensor[self._compared.grid])
             rows.append(row)
         columns = {name: np.array([row.get(name, math.nan) for row in rows]) for name in _names(rows)}
         return DepthJudgement(
@@ -197,28 +187,28 @@ class DepthJudge:
             within_one_sigma=_optional(columns, "within_one_sigma"),
             over_depth=bins.result(),
             frames=self.frames,
-            pixels=sum(len(ratio) for ratio in self._ratios),
-            coverage=sum(len(ratio) for ratio in self._ratios) / self._sensor_pixels,
+            pixels=self._compared.pixels,
+            coverage=self._compared.coverage,
             per_frame={name: tuple(column.tolist()) for name, column in columns.items()},
         )
 
     def _scaled(
         self, depth: Floats, sensor: Floats, factor: float, log_factor: float
     ) -> list[tuple[str, Floats]]:
-        d, s = depth[self._grid], sensor[self._grid]
+        d, s = depth[self._compared.grid], sensor[self._compared.grid]
         both = (d > 0) & (s > 0)
         fit = affine_fit(d[both], s[both], self.kind)
         scaled = [
             ("sequence_median", depth * factor),
             ("frame_median", depth * math.exp(log_factor)),
-            ("frame_affine", apply_affine(depth, fit, self.kind, self.min_m, self.max_m)),
+            ("frame_affine", apply_affine(depth, fit, self.kind, self._compared.min_m, self._compared.max_m)),
         ]
         return [("as_predicted", depth), *scaled] if self.kind is DepthKind.METRIC else scaled
 
     def _figures(self, depth_m: Floats, sensor_m: Floats, edges: EdgeScore) -> dict[str, float]:
         known = (depth_m > 0) & (sensor_m > 0)
-        chosen = known[self._grid]
-        errors = depth_errors(depth_m[self._grid][chosen], sensor_m[self._grid][chosen])
+        chosen = known[self._compared.grid]
+        errors = depth_errors(depth_m[self._compared.grid][chosen], sensor_m[self._compared.grid][chosen])
         return {
             **asdict(errors),
             "ssim": depth_ssim(depth_m, sensor_m, known),
@@ -256,15 +246,16 @@ class _Bins:
 
 
 def _uncertainty(
-    depth: Floats, sensor_m: Floats, sigma: NDArray[np.floating] | None, is_metric: bool
+    found: FramePixels, sigma_log: NDArray[np.floating] | None, is_metric: bool
 ) -> dict[str, float]:
-    if sigma is None or len(depth) < 2:
+    if sigma_log is None or len(found.depth) < 2:
         return {}
-    error = np.log(depth / sensor_m)
+    sigma = sigma_log[found.where]
+    error = np.log(found.depth / found.sensor_m)
     scaled = np.abs(np.expm1(error - np.median(error)))
     sure = sigma <= np.median(sigma)
-    found = {"surest_half": float(scaled[sure].mean() / max(float(scaled.mean()), 1e-9))}
-    return {**found, "within_one_sigma": float(np.mean(np.abs(error) < sigma))} if is_metric else found
+    known = {"surest_half": float(scaled[sure].mean() / max(float(scaled.mean()), 1e-9))}
+    return {**known, "within_one_sigma": float(np.mean(np.abs(error) < sigma))} if is_metric else known
 
 
 def _names(rows: list[dict[str, float]]) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset
 from slamdepth.errors import DatasetError, ImageDecodeError
-from slamdepth.evaluation import DepthAccumulator, DepthScore, TrajectoryScore, score_trajectory
+from slamdepth.evaluation import DepthScore, DepthScorer, TrajectoryScore, score_trajectory
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, Stage
 from slamdepth.report import MeshCounts
 from slamdepth.types import DepthKind, Keyframe, Reconstruction, Trajectory
@@ -67,11 +67,11 @@ def judge_trajectory(
         return None, (f"the trajectory is not scored: {error}",)
 
 
-def judge_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore | None:
+def score_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore | None:
     """Compare the keyframes' predicted depth, as the tracker was given it, with the sensor's."""
     if not dataset.has_depth:
         return None
-    judged = DepthAccumulator()
+    scorer = DepthScorer()
     for keyframe in keyframes:
         if keyframe.prediction.is_sensor or keyframe.prediction.kind is not DepthKind.METRIC:
             continue
@@ -81,5 +81,5 @@ def judge_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore
             logger.debug("keyframe %d is not judged: %s", keyframe.id, error)
             continue
         if sensor_m is not None:
-            judged.add(keyframe.prediction.values, sensor_m)
-    return judged.score()
+            scorer.add(keyframe.prediction.values, sensor_m)
+    return scorer.score()

@@ -35,9 +35,9 @@ from slamdepth.pipeline.prediction_scale import (
     choose_prediction_scale,
 )
 from slamdepth.pipeline.results import (
-    judge_depth,
     judge_trajectory,
     keyframe_trajectory,
+    score_depth,
     write_keyframe_mesh,
 )
 from slamdepth.pipeline.scale import settle_scale
@@ -185,7 +185,7 @@ def _finish(
             weights=(*model.weights, *feature_weights(config.features)),
             steps=tracked.steps,
             trajectory_score=trajectory_score,
-            depth_score=judge_depth(dataset, reconstruction.keyframes),
+            depth_score=score_depth(dataset, reconstruction.keyframes),
             mesh=mesh,
             skipped_frames=tracked.skipped,
             notes=tuple(notes),
