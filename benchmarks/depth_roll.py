@@ -29,7 +29,7 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.depth.evaluate import judge_depth
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import DatasetError, SlamdepthError
-from slamdepth.evaluation.depth_judge import DepthJudgement
+from slamdepth.evaluation import DepthJudge, DepthJudgement
 from slamdepth.io import write_json
 from slamdepth.pipeline.depth_data import readable, thinned
 from slamdepth.pipeline.training_data import SequencePlace
@@ -56,30 +56,22 @@ def true_roll(truth: Trajectory, up_w: NDArray[np.float64]) -> Callable[[Frame],
     return roll
 
 
-class TurnedUpright:
-    """A depth model that is shown images without their roll.
+def predicted_upright(
+    model: DepthModel, frame: Frame, angle_rad: float, otherwise: DepthPrediction
+) -> DepthPrediction:
+    """What a model predicts for an image turned upright, as of the image as taken.
 
     Args:
-        roll: of a frame, in radians, see :func:`roll_rad`; None leaves it as it is.
+        angle_rad: the frame's roll, see :func:`roll_rad`.
+        otherwise: its prediction for the image as taken, which counts where the turned one was cut off.
     """
-
-    def __init__(self, model: DepthModel, roll: Callable[[Frame], float | None]) -> None:
-        self._model, self._roll = model, roll
-        self.name, self.kind, self.weights = model.name, model.kind, model.weights
-
-    def predict(self, frame: Frame) -> DepthPrediction:
-        """Depth of every raw pixel; errors as of the model."""
-        plain = self._model.predict(frame)
-        roll = self._roll(frame)
-        if roll is None:
-            return plain
-        image = turned(frame.image_rgb, frame.camera, -roll)
-        upright = self._model.predict(replace(frame, image_rgb=image, depth_m=None))
-        values = turned_back(upright.values, plain.values, frame.camera, roll)
-        sigma = upright.sigma_log
-        if sigma is not None and plain.sigma_log is not None:
-            sigma = turned_back(sigma, plain.sigma_log, frame.camera, roll)
-        return replace(plain, values=values, sigma_log=sigma)
+    image = turned(frame.image_rgb, frame.camera, -angle_rad)
+    upright = model.predict(replace(frame, image_rgb=image, depth_m=None))
+    values = turned_back(upright.values, otherwise.values, frame.camera, angle_rad)
+    sigma = upright.sigma_log
+    if sigma is not None and otherwise.sigma_log is not None:
+        sigma = turned_back(sigma, otherwise.sigma_log, frame.camera, angle_rad)
+    return replace(otherwise, values=values, sigma_log=sigma)
 
 
 def turned(image_rgb: NDArray[np.uint8], camera: Camera, angle_rad: float) -> NDArray[np.uint8]:
@@ -105,8 +97,8 @@ def _warped(
 
 def judged(
     dataset: Dataset, model: DepthModel, up_w: NDArray[np.float64], stride: int
-) -> list[DepthJudgement]:
-    """As taken, and turned upright.
+) -> tuple[DepthJudgement, DepthJudgement]:
+    """As taken, and turned upright; where no true pose tells the roll, both are as taken.
 
     Raises:
         DatasetError: the sequence has no ground truth or no depth.
@@ -114,9 +106,19 @@ def judged(
     if dataset.ground_truth is None:
         raise DatasetError(f"{dataset.path}: has no ground truth to tell the roll by; leave it out")
     place = SequencePlace.of(dataset)
-    upright = TurnedUpright(model, true_roll(dataset.ground_truth, up_w))
-    chosen = thinned(place, stride)
-    return [judge_depth(m, readable(place, chosen)) for m in (model, upright)]
+    roll_of = true_roll(dataset.ground_truth, up_w)
+    upright = DepthJudge(model.kind)
+
+    def turn(frame: Frame, plain: DepthPrediction) -> None:
+        assert frame.depth_m is not None
+        roll = roll_of(frame)
+        prediction = plain if roll is None else predicted_upright(model, frame, roll, plain)
+        upright.add(prediction, frame.depth_m)
+
+    as_taken = judge_depth(model, readable(place, thinned(place, stride)), watch=turn)
+    turned_upright = upright.judge()
+    assert turned_upright is not None
+    return as_taken, turned_upright
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

@@ -9,8 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from made_up import MadeUpDataset
 
-from benchmarks.depth_roll import TurnedUpright, main, roll_rad, true_roll
+from benchmarks.depth_roll import judged, main, predicted_upright, roll_rad, true_roll
 from slamdepth.geometry import se3_exp
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Trajectory
 
@@ -57,24 +58,56 @@ def test_the_roll_of_a_pose_is_that_of_down_in_the_image(angle: float, tilt: flo
 def test_an_image_is_shown_upright_and_its_depth_comes_back_as_taken(angle: float) -> None:
     model = Brightness()
     frame = Frame(0, 0.0, ramp_as_taken(angle), CAMERA)
-    made = TurnedUpright(model, lambda _: angle).predict(frame)
+    plain = model.predict(frame)
+    made = predicted_upright(model, frame, angle, plain)
     upright = model.seen[1][40:80, 50:110, 0].astype(float)
     assert np.ptp(upright, axis=1).max() <= 2  # rows are level now
     assert (np.diff(upright.mean(axis=1)) > 0.5).all()
-    np.testing.assert_allclose(made.values, model.predict(frame).values, atol=2.5)
+    np.testing.assert_allclose(made.values, plain.values, atol=2.5)
     assert made.sigma_log is not None
     assert (made.sigma_log == np.float32(0.1)).all()
 
 
-def test_a_frame_without_a_pose_near_in_time_is_left_as_it_is() -> None:
+def test_the_roll_of_a_frame_is_that_of_the_pose_nearest_in_time_if_one_is_near() -> None:
     truth = Trajectory(np.array([0.0, 1.0]), np.stack([rolled(0.3), rolled(-0.2)]))
     roll = true_roll(truth, UP)
     frame = Frame(0, 0.98, ramp_as_taken(0.0), CAMERA)
     assert roll(frame) == pytest.approx(-0.2)
     assert roll(replace(frame, timestamp_s=0.5)) is None
-    model = Brightness()
-    TurnedUpright(model, roll).predict(replace(frame, timestamp_s=0.5))
-    assert len(model.seen) == 1
+
+
+class FloorByRows(Brightness):
+    """Takes the image's rows for those of an upright camera."""
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        self.seen.append(frame.image_rgb)
+        rows = np.arange(120, dtype=np.float32)[:, None]
+        return DepthPrediction(np.repeat(5.0 - 0.02 * rows, 160, axis=1), self.kind)
+
+
+class RolledFloor(MadeUpDataset):
+    """A floor, by a camera rolled by 0.4 rad; the third of its four frames has no pose near in time."""
+
+    camera = CAMERA
+
+    def __init__(self) -> None:
+        super().__init__(4)
+        self.ground_truth = Trajectory(self.timestamps_s[[0, 1, 3]], np.stack([rolled(0.4)] * 3))
+
+    def read(self, index: int, *, with_depth: bool = False) -> Frame:
+        image = ramp_as_taken(0.4)
+        depth_m = 5.0 - 0.02 * (CAMERA.cy + (image[..., 0] - 128.0) / 0.8)
+        return Frame(index, float(self.timestamps_s[index]), image, CAMERA, depth_m.astype(np.float32))
+
+
+def test_each_image_is_predicted_once_as_taken_and_once_upright() -> None:
+    model = FloorByRows()
+    as_taken, upright = judged(RolledFloor(), model, UP, stride=1)
+    assert len(model.seen) == 4 + 3
+    of_taken, of_upright = (np.array(j.per_frame["as_predicted.abs_rel"]) for j in (as_taken, upright))
+    assert (of_taken > 0.08).all()
+    assert (of_upright[[0, 1, 3]] < 0.03).all()  # what is left was cut off at the corners
+    assert of_upright[2] == of_taken[2]
 
 
 def test_a_sequence_without_poses_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
