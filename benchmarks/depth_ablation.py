@@ -17,6 +17,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress as Bar
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.depth_places import DEFAULT_CONFIG, config_without
 from benchmarks.depth_rows import judged_row, table
 from slamdepth.depth.base import DepthModel
@@ -24,7 +25,6 @@ from slamdepth.depth.registry import create_depth_model
 from slamdepth.depth.training.config import TrainConfig, digest
 from slamdepth.depth.training.loop import steps_per_epoch, train_depth
 from slamdepth.depth.training.progress import TrainStep
-from slamdepth.errors import SlamdepthError
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "as shipped": {},
@@ -67,6 +67,7 @@ def variant_config(base: TrainConfig, change: dict[str, Any], *, samples: int, s
     return TrainConfig.from_dict(values, origin="benchmarks.depth_ablation")
 
 
+@errors_in_one_line
 def main(arguments: list[str]) -> int:
     """Train, judge, print the table."""
     parser = argparse.ArgumentParser(
@@ -83,33 +84,29 @@ def main(arguments: list[str]) -> int:
     asked = parser.parse_args(arguments)
     console = Console(stderr=True)
     rows = []
-    try:
-        base = TrainConfig.from_yaml(asked.config)
-        with Bar(console=console, disable=not console.is_terminal, transient=True) as bar:
-            for label in asked.variants or VARIANTS:
-                config = variant_config(base, VARIANTS[label], samples=asked.samples, steps=asked.steps)
-                key = digest(config)
-                head = asked.output / f"{key}.safetensors"
-                task = bar.add_task(label, total=1.0)
+    base = TrainConfig.from_yaml(asked.config)
+    with Bar(console=console, disable=not console.is_terminal, transient=True) as bar:
+        for label in asked.variants or VARIANTS:
+            config = variant_config(base, VARIANTS[label], samples=asked.samples, steps=asked.steps)
+            key = digest(config)
+            head = asked.output / f"{key}.safetensors"
+            task = bar.add_task(label, total=1.0)
 
-                def tell(step: TrainStep, task: Any = task, label: str = label) -> None:
-                    share, what = step.done / step.total, f"{label}: {step.stage} {step.detail}"
-                    bar.update(task, completed=share, description=what)
+            def tell(step: TrainStep, task: Any = task, label: str = label) -> None:
+                share, what = step.done / step.total, f"{label}: {step.stage} {step.detail}"
+                bar.update(task, completed=share, description=what)
 
-                def made(config: TrainConfig = config, head: Path = head, tell: Any = tell) -> DepthModel:
-                    if not head.is_file():
-                        named = TrainConfig.from_dict({**config.model_dump(), "output": str(head)})
-                        train_depth(named, device=asked.device, progress=tell)
-                    return create_depth_model("dinov2", weights=head, device=asked.device)
+            def made(config: TrainConfig = config, head: Path = head, tell: Any = tell) -> DepthModel:
+                if not head.is_file():
+                    named = TrainConfig.from_dict({**config.model_dump(), "output": str(head)})
+                    train_depth(named, device=asked.device, progress=tell)
+                return create_depth_model("dinov2", weights=head, device=asked.device)
 
-                for path in asked.data:
-                    file = asked.output / f"{key}@{path.resolve().name}.json"
-                    rows.append(
-                        judged_row(file, label, made, path.resolve(), {"training": key}, stride=asked.stride)
-                    )
-    except SlamdepthError as error:
-        print("error:", error, file=sys.stderr)
-        return error.exit_code
+            for path in asked.data:
+                file = asked.output / f"{key}@{path.resolve().name}.json"
+                rows.append(
+                    judged_row(file, label, made, path.resolve(), {"training": key}, stride=asked.stride)
+                )
     print(table(rows))
     return 0
 

@@ -23,6 +23,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress as Bar
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.depth_baseline_models import ConstantDepth, MeanImageDepth, PixelMlp
 from benchmarks.depth_rows import judged_row, table
 from slamdepth.depth import weights as store
@@ -34,7 +35,7 @@ from slamdepth.depth.training.data import data_folder
 from slamdepth.depth.training.mlp import MlpPairs, MlpSettings, cached_tokens, read_pairs, train_mlp
 from slamdepth.depth.training.progress import Progress, TrainStep
 from slamdepth.depth.training.readers.pairs import PairPlace, PairReader
-from slamdepth.errors import SlamdepthError, WeightsError
+from slamdepth.errors import WeightsError
 
 TRAINED = {
     "dinov2-mlp-32": ("tokens", 32),
@@ -134,6 +135,7 @@ def _was_trained(file: Path, said: str) -> bool:
         return False
 
 
+@errors_in_one_line
 def main(arguments: list[str]) -> int:
     """Train, judge, print the table."""
     parser = argparse.ArgumentParser(
@@ -154,19 +156,15 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--stride", type=int, help="default: 10 of a sequence, 1 of training pairs")
     parser.add_argument("--max-frames", type=int)
     asked = parser.parse_args(arguments)
-    try:
-        folders = asked.train or [
-            path for path in sorted(data_folder("depth_training").iterdir())
-            if (path / "camera.json").is_file() and path.name != LEFT_OUT
-        ]  # fmt: skip
-        places = [_thinned(PairReader().open(folder), asked.train_stride) for folder in folders]
-        settings = MlpSettings(
-            epochs=asked.epochs, batch=asked.batch, learning_rate=asked.learning_rate, seed=asked.seed
-        )
-        rows = _rows(asked, places, settings)
-    except SlamdepthError as error:
-        print("error:", error, file=sys.stderr)
-        return error.exit_code
+    folders = asked.train or [
+        path for path in sorted(data_folder("depth_training").iterdir())
+        if (path / "camera.json").is_file() and path.name != LEFT_OUT
+    ]  # fmt: skip
+    places = [_thinned(PairReader().open(folder), asked.train_stride) for folder in folders]
+    settings = MlpSettings(
+        epochs=asked.epochs, batch=asked.batch, learning_rate=asked.learning_rate, seed=asked.seed
+    )
+    rows = _rows(asked, places, settings)
     print(table(rows))
     return 0
 

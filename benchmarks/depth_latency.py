@@ -24,10 +24,11 @@ from rich.console import Console
 # Read when PyTorch loads; as the command line has it, so that times are those a user gets.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.depth_latency_stages import stage_row
 from benchmarks.depth_latency_variants import VARIANTS, variant_row
 from benchmarks.summary import environment
-from slamdepth.errors import ConfigError, SlamdepthError
+from slamdepth.errors import ConfigError
 from slamdepth.io import write_json
 
 FORMAT = 1
@@ -97,6 +98,7 @@ def measure(
     return stages, variants
 
 
+@errors_in_one_line
 def main(arguments: list[str]) -> int:
     """Measure what the command line names and print both tables."""
     parser = argparse.ArgumentParser(
@@ -117,15 +119,11 @@ def main(arguments: list[str]) -> int:
     asked = parser.parse_args(arguments)
     console = Console(stderr=True)
     begun = environment()
-    try:
-        stages, variants = measure(asked, lambda what: console.print(what, style="dim"))
-        if asked.output is not None:
-            settings = {key: value for key, value in vars(asked).items() if key != "output"}
-            about = {"format": FORMAT, "environment": begun, "settings": settings}
-            write_json(asked.output, {**about, "stages": stages, "variants": variants})
-    except SlamdepthError as error:
-        print("error:", error, file=sys.stderr)
-        return error.exit_code
+    stages, variants = measure(asked, lambda what: console.print(what, style="dim"))
+    if asked.output is not None:
+        settings = {key: value for key, value in vars(asked).items() if key != "output"}
+        about = {"format": FORMAT, "environment": begun, "settings": settings}
+        write_json(asked.output, {**about, "stages": stages, "variants": variants})
     print(stages_table(stages))
     print()
     print(variants_table(variants))

@@ -21,6 +21,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress as Bar
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.depth_rows import judged_row, mean_row, table
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
@@ -28,7 +29,7 @@ from slamdepth.depth.training.config import TrainConfig, digest
 from slamdepth.depth.training.data import data_folder
 from slamdepth.depth.training.loop import train_depth
 from slamdepth.depth.training.progress import TrainStep
-from slamdepth.errors import ConfigError, SlamdepthError
+from slamdepth.errors import ConfigError
 from slamdepth.pipeline.training_data import sequence_readers
 
 DEFAULT_CONFIG = Path(__file__).resolve().parents[1] / "slamdepth" / "depth" / "configs" / "dinov2_head.yaml"
@@ -145,6 +146,7 @@ def leave_one_out(
     return of_places, of_sequences
 
 
+@errors_in_one_line
 def main(arguments: list[str]) -> int:
     """Train, judge, print the tables."""
     parser = argparse.ArgumentParser(
@@ -165,41 +167,35 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--device", default="cpu")
     asked = parser.parse_args(arguments)
     console = Console(stderr=True)
-    try:
-        base = TrainConfig.from_yaml(asked.config)
-        base = unmixed(base) if asked.unmixed else base
-        if asked.first_source_only:
-            real = tuple(s for s in base.sources if s.folder == base.sources[0].folder)
-            base = base.model_copy(update={"sources": real})
-        with Bar(console=console, disable=not console.is_terminal, transient=True) as bar:
+    base = TrainConfig.from_yaml(asked.config)
+    base = unmixed(base) if asked.unmixed else base
+    if asked.first_source_only:
+        real = tuple(s for s in base.sources if s.folder == base.sources[0].folder)
+        base = base.model_copy(update={"sources": real})
+    with Bar(console=console, disable=not console.is_terminal, transient=True) as bar:
 
-            def train(config: TrainConfig) -> object:
-                head = Path(config.output).stem
-                task = bar.add_task(head)
+        def train(config: TrainConfig) -> object:
+            head = Path(config.output).stem
+            task = bar.add_task(head)
 
-                def show(step: TrainStep) -> None:
-                    described = f"{head}: {step.stage} {step.detail}".rstrip()
-                    bar.update(task, completed=step.done, total=step.total, description=described)
+            def show(step: TrainStep) -> None:
+                described = f"{head}: {step.stage} {step.detail}".rstrip()
+                bar.update(task, completed=step.done, total=step.total, description=described)
 
-                return train_depth(config, device=asked.device, progress=show, readers=sequence_readers())
+            return train_depth(config, device=asked.device, progress=show, readers=sequence_readers())
 
-            of_places, of_sequences = leave_one_out(
-                base,
-                asked.output,
-                leave_out=tuple(asked.leave_out if asked.leave_out is not None else places_of(base)),
-                zero_shot=tuple(asked.zero_shot),
-                samples=asked.samples,
-                overruled={
-                    name: getattr(asked, name) for name in OVERRULED if getattr(asked, name) is not None
-                },
-                train=train,
-                load=lambda head: create_depth_model("dinov2", weights=head, device=asked.device),
-                stride=asked.stride,
-                max_frames=asked.max_frames,
-            )
-    except SlamdepthError as error:
-        print("error:", error, file=sys.stderr)
-        return error.exit_code
+        of_places, of_sequences = leave_one_out(
+            base,
+            asked.output,
+            leave_out=tuple(asked.leave_out if asked.leave_out is not None else places_of(base)),
+            zero_shot=tuple(asked.zero_shot),
+            samples=asked.samples,
+            overruled={name: getattr(asked, name) for name in OVERRULED if getattr(asked, name) is not None},
+            train=train,
+            load=lambda head: create_depth_model("dinov2", weights=head, device=asked.device),
+            stride=asked.stride,
+            max_frames=asked.max_frames,
+        )
     mean = [mean_row("each without the place", of_places)] if of_places else []
     print(table([*of_places, *mean, *of_sequences]))
     return 0

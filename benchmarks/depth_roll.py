@@ -22,13 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.markdown import markdown_table
 from benchmarks.summary import environment
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.evaluate import judge_depth
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.errors import DatasetError, SlamdepthError
+from slamdepth.errors import DatasetError
 from slamdepth.evaluation import DepthJudge, DepthJudgement
 from slamdepth.io import write_json
 from slamdepth.pipeline.depth_data import readable, thinned
@@ -149,25 +150,22 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+@errors_in_one_line
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parse(arguments)
     rows: list[dict[str, Any]] = []
-    try:
-        up_w = np.array(options.up)
-        model = create_depth_model("dinov2")
-        for path in options.sequences:
-            dataset = open_dataset(path)
-            with Console(stderr=True).status(f"{dataset.name}: predicting"):
-                found = judged(dataset, model, up_w, options.stride)
-            for label, judgement in zip(("as taken", "turned upright"), found, strict=True):
-                rows.append({"sequence": dataset.name, "images": label, **judgement.to_dict()})
-        if options.output:
-            weights = [asdict(info) for info in model.weights]
-            write_json(options.output, {"environment": environment(), "weights": weights, "rows": rows})
-    except SlamdepthError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    up_w = np.array(options.up)
+    model = create_depth_model("dinov2")
+    for path in options.sequences:
+        dataset = open_dataset(path)
+        with Console(stderr=True).status(f"{dataset.name}: predicting"):
+            found = judged(dataset, model, up_w, options.stride)
+        for label, judgement in zip(("as taken", "turned upright"), found, strict=True):
+            rows.append({"sequence": dataset.name, "images": label, **judgement.to_dict()})
+    if options.output:
+        weights = [asdict(info) for info in model.weights]
+        write_json(options.output, {"environment": environment(), "weights": weights, "rows": rows})
     print(table(rows))
     return 0
 

@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.progress import Progress as Bar
 from torch import nn
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.depth_places import DEFAULT_CONFIG, config_without, places_of, unmixed
 from benchmarks.depth_rows import read_row
 from benchmarks.depth_trial_heads import DptLikeHead, LinearHead, Loss, mse_ssim, normals_too
@@ -36,7 +37,6 @@ from slamdepth.depth.training.features import FeatureCache, load_batch
 from slamdepth.depth.training.loop import head_shape, learning_rate
 from slamdepth.depth.training.losses import total_loss
 from slamdepth.depth.training.stages import coarse_target, predict
-from slamdepth.errors import SlamdepthError
 from slamdepth.io import write_json
 
 _GROUPS = 3
@@ -205,6 +205,7 @@ def table(results: dict[str, list[dict[str, dict[str, float]]]]) -> str:
     return markdown_table(["trial", "seeds", *_HEADINGS, "frame median more than first, % points"], rows)
 
 
+@errors_in_one_line
 def main(arguments: list[str]) -> int:
     """Train, judge, print the table."""
     parser = argparse.ArgumentParser(
@@ -221,31 +222,27 @@ def main(arguments: list[str]) -> int:
     console = Console(stderr=True)
     labels = asked.trials or list(TRIALS)
     results: dict[str, list[dict[str, dict[str, float]]]] = {label: [] for label in labels}
-    try:
-        base = TrainConfig.from_yaml(asked.config)
-        base = base.model_copy(update={"batch": asked.batch}) if asked.batch else base
-        encoder = open_encoder(base.backbone)
-        with Bar(console=console, disable=not console.is_terminal, transient=True) as bar:
-            task = bar.add_task("", total=asked.seeds * len(labels))
-            for seed in range(asked.seeds):
-                for label in labels:
-                    bar.update(task, description=f"{label}, seed {seed}")
-                    settings = {"base": digest(base), "trial": label, "seed": seed, "steps": asked.steps,
-                                "samples": asked.samples}  # fmt: skip
-                    file = asked.output / f"{digest(base, settings)}.json"
-                    row = read_row(file, settings)
-                    if row is None:
-                        found = try_out(
-                            base, TRIALS[label], encoder, samples=asked.samples, steps=asked.steps, seed=seed
-                        )
-                        row = {"settings": settings, "environment": environment(), "places": found}
-                        file.parent.mkdir(parents=True, exist_ok=True)
-                        write_json(file, row)
-                    results[label].append(row["places"])
-                    bar.advance(task)
-    except SlamdepthError as error:
-        print("error:", error, file=sys.stderr)
-        return error.exit_code
+    base = TrainConfig.from_yaml(asked.config)
+    base = base.model_copy(update={"batch": asked.batch}) if asked.batch else base
+    encoder = open_encoder(base.backbone)
+    with Bar(console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("", total=asked.seeds * len(labels))
+        for seed in range(asked.seeds):
+            for label in labels:
+                bar.update(task, description=f"{label}, seed {seed}")
+                settings = {"base": digest(base), "trial": label, "seed": seed, "steps": asked.steps,
+                            "samples": asked.samples}  # fmt: skip
+                file = asked.output / f"{digest(base, settings)}.json"
+                row = read_row(file, settings)
+                if row is None:
+                    found = try_out(
+                        base, TRIALS[label], encoder, samples=asked.samples, steps=asked.steps, seed=seed
+                    )
+                    row = {"settings": settings, "environment": environment(), "places": found}
+                    file.parent.mkdir(parents=True, exist_ok=True)
+                    write_json(file, row)
+                results[label].append(row["places"])
+                bar.advance(task)
     print(table(results))
     return 0
 

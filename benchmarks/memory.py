@@ -21,13 +21,13 @@ from typing import Any
 
 from rich.console import Console
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.markdown import markdown_table
 from benchmarks.summary import environment
 from benchmarks.worker import memory_mib
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.errors import SlamdepthError
 from slamdepth.io import write_json
 from slamdepth.pipeline.run import seed_everything, seed_torch
 from slamdepth.tracker import Tracker
@@ -125,6 +125,7 @@ def table(samples: list[Sample]) -> str:
     return markdown_table(heads, [[f"{value:.0f}" for value in asdict(s).values()] for s in samples])
 
 
+@errors_in_one_line
 def main(arguments: list[str]) -> int:
     """Measure what the command line names and print it."""
     parser = argparse.ArgumentParser(
@@ -144,24 +145,20 @@ def main(arguments: list[str]) -> int:
             parser.error(f"--{name} must be at least 1, got {value}")
     console = Console(stderr=True)
     begun = environment()
-    try:
-        changed: dict[str, Any] = {} if asked.budget is None else {"keyframe_memory_mib": asked.budget}
-        config = Config.from_dict({"map": changed}, origin="--budget")
-        dataset = open_dataset(asked.data / asked.sequence)
-        seed_everything(config.seed)
-        model = create_depth_model(asked.depth, seed=config.seed)
-        seed_torch(config.seed)
-        samples, figures = measure(
-            dataset, Tracker(dataset.camera, model, config), asked,
-            lambda s: console.print(f"{s.frames} frames: {s.resident:.0f} MiB", style="dim"),
-        )  # fmt: skip
-        if asked.output is not None:
-            chosen = {key: str(value) for key, value in vars(asked).items() if key not in ("data", "output")}
-            about = {"format": FORMAT, "environment": begun, "settings": chosen}
-            write_json(asked.output, {**about, "samples": [asdict(s) for s in samples], "figures": figures})
-    except SlamdepthError as error:
-        print("error:", error, file=sys.stderr)
-        return error.exit_code
+    changed: dict[str, Any] = {} if asked.budget is None else {"keyframe_memory_mib": asked.budget}
+    config = Config.from_dict({"map": changed}, origin="--budget")
+    dataset = open_dataset(asked.data / asked.sequence)
+    seed_everything(config.seed)
+    model = create_depth_model(asked.depth, seed=config.seed)
+    seed_torch(config.seed)
+    samples, figures = measure(
+        dataset, Tracker(dataset.camera, model, config), asked,
+        lambda s: console.print(f"{s.frames} frames: {s.resident:.0f} MiB", style="dim"),
+    )  # fmt: skip
+    if asked.output is not None:
+        chosen = {key: str(value) for key, value in vars(asked).items() if key not in ("data", "output")}
+        about = {"format": FORMAT, "environment": begun, "settings": chosen}
+        write_json(asked.output, {**about, "samples": [asdict(s) for s in samples], "figures": figures})
     print(table(samples))
     print()
     for name, value in figures.items():

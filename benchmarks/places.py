@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks import places_methods as methods
+from benchmarks.command import errors_in_one_line
 from benchmarks.markdown import markdown_table
 from benchmarks.places_scores import score_answers
 from benchmarks.places_truth import labels, overlaps
@@ -29,7 +30,7 @@ from slamdepth.datasets import Dataset
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.depth.sensor import SensorDepth
-from slamdepth.errors import ConfigError, DatasetError, SlamdepthError
+from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.io import write_json, write_text
 
 if TYPE_CHECKING:
@@ -210,26 +211,23 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+@errors_in_one_line
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parse(arguments)
-    try:
-        if options.stride < 1 or options.apart < 0:
-            raise ConfigError("--stride must be at least 1 and --apart no less than 0")
-        names = [name.strip() for name in options.sequences.split(",")] if options.sequences else None
-        begun = environment()
-        rows: list[dict[str, Any]] = []
-        for name, dataset in find_sequences(options.data, names).items():
-            tell(f"{name}: reading every {options.stride}th frame")
-            rows += judge(
-                name, dataset,
-                stride=options.stride, max_frames=options.max_frames, apart_s=options.apart,
-            )  # fmt: skip
-            if options.output:
-                _write(options, begun, rows)
-    except SlamdepthError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    if options.stride < 1 or options.apart < 0:
+        raise ConfigError("--stride must be at least 1 and --apart no less than 0")
+    names = [name.strip() for name in options.sequences.split(",")] if options.sequences else None
+    begun = environment()
+    rows: list[dict[str, Any]] = []
+    for name, dataset in find_sequences(options.data, names).items():
+        tell(f"{name}: reading every {options.stride}th frame")
+        rows += judge(
+            name, dataset,
+            stride=options.stride, max_frames=options.max_frames, apart_s=options.apart,
+        )  # fmt: skip
+        if options.output:
+            _write(options, begun, rows)
     print(table(rows))
     return 0
 

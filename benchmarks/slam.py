@@ -18,12 +18,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks.command import errors_in_one_line
 from benchmarks.jobs import Job, run_job
 from benchmarks.orbslam3 import HOW_TO_INSTALL
 from benchmarks.rows import ABLATIONS, NONE, SENSOR, SYSTEMS, Row, config_of, plan_ablation, plan_rows
 from benchmarks.summary import FORMAT, environment, read_benchmark, summarise
 from slamdepth.datasets import Dataset, open_dataset
-from slamdepth.errors import CameraError, ConfigError, DatasetError, SlamdepthError
+from slamdepth.errors import CameraError, ConfigError, DatasetError
 from slamdepth.frontend.features import create_extractor, needs_weights
 from slamdepth.io import write_json, write_text
 
@@ -209,43 +210,40 @@ def _features(options: argparse.Namespace) -> list[dict[str, Any]]:
     return [{"name": name, **(given if needs_weights(name) else {})} for name in options.features]
 
 
+@errors_in_one_line
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parse(arguments)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    earlier = read_benchmark(options.compare) if options.compare else None
+    plan = make_plan(options)
+    begun = environment()
+    if begun["load_average"] is not None and begun["load_average"] > _BUSY:
+        tell(f"the machine is busy (load {begun['load_average']:.1f}): speeds will suffer")
+    rows: list[dict[str, Any]] = []
+    benchmark = {
+        "format": FORMAT,
+        "environment": begun,
+        "settings": {
+            "runs": plan.runs,
+            "pace": plan.base.pace,
+            "stride": plan.base.stride,
+            "max_frames": plan.base.max_frames,
+            "vocabulary": "given" if plan.vocabulary else "trained",
+            "ablations": ABLATIONS if options.ablation else {},
+        },
+        "rows": rows,
+    }
+    code = 0
     try:
-        earlier = read_benchmark(options.compare) if options.compare else None
-        plan = make_plan(options)
-        begun = environment()
-        if begun["load_average"] is not None and begun["load_average"] > _BUSY:
-            tell(f"the machine is busy (load {begun['load_average']:.1f}): speeds will suffer")
-        rows: list[dict[str, Any]] = []
-        benchmark = {
-            "format": FORMAT,
-            "environment": begun,
-            "settings": {
-                "runs": plan.runs,
-                "pace": plan.base.pace,
-                "stride": plan.base.stride,
-                "max_frames": plan.base.max_frames,
-                "vocabulary": "given" if plan.vocabulary else "trained",
-                "ablations": ABLATIONS if options.ablation else {},
-            },
-            "rows": rows,
-        }
-        code = 0
-        try:
-            for row in run_plan(plan):
-                rows.append(row)
-                if options.output:
-                    write_json(options.output, benchmark)  # what is done is kept, whatever comes
-        except KeyboardInterrupt:
-            tell("interrupted; the table holds what was done")
-            code = 130
-        _publish(benchmark, earlier, options.output)
-    except SlamdepthError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+        for row in run_plan(plan):
+            rows.append(row)
+            if options.output:
+                write_json(options.output, benchmark)  # what is done is kept, whatever comes
+    except KeyboardInterrupt:
+        tell("interrupted; the table holds what was done")
+        code = 130
+    _publish(benchmark, earlier, options.output)
     return code
 
 
