@@ -21,6 +21,7 @@ from tracking_scene import (
     position_errors_m,
 )
 
+from slamdepth.config import Config
 from slamdepth.types import DepthPrediction, Frame, TrackingStatus
 
 TRACKING, LOST = TrackingStatus.TRACKING, TrackingStatus.LOST
@@ -102,6 +103,14 @@ def test_dark_frames_are_placed_by_their_depth() -> None:
     assert errors[30:35].max() < 0.03
     assert all(T is not None for T in online.values())
     assert ate_m(made.trajectory) < 0.015
+
+
+def test_frames_without_a_feature_before_a_rolling_shutter() -> None:
+    """Nothing tells how far away a pixel is where the frame before was placed by its depth alone."""
+    config = Config.from_dict({"shutter": {"readout_ms": 20}})
+    run = Run(frames(range(40), between(30, 33, grey)), config=config)
+    assert run.status_of(31) is TrackingStatus.RESCUED
+    assert len(run.finish().trajectory) == 40
 
 
 def test_after_dark_frames_the_map_grows_again() -> None:

@@ -175,10 +175,11 @@ class Tracker:
         if not self._shutter.rolls or self._motion.last is None:
             return plain
         T_guess = self._motion.guess(frame.timestamp_s)
-        near = np.full(
-            len(plain), np.median(self._shutter.inverse_depth(T_guess, self._motion.last.point_ids))
-        )
-        return self._shutter.correct(plain, self._motion.velocity(frame.timestamp_s, T_guess), near)
+        inverse = self._shutter.inverse_depth(T_guess, self._motion.last.point_ids)
+        # a frame placed by its depth alone may have no features at all: far away, then
+        usual = float(np.median(inverse)) if len(inverse) else 0.0
+        velocity = self._motion.velocity(frame.timestamp_s, T_guess)
+        return self._shutter.correct(plain, velocity, np.full(len(plain), usual))
 
     def _settle(
         self, frame: Frame, plain: Features, features: Features, placement: Placement
