@@ -4,7 +4,9 @@
 The rooms are those of ``data_scripts/training_rooms.py``. Views are chosen for variety,
 not for a smooth path: a random point, often one on a table, is looked at from a random
 distance and direction, down to almost straight from above, half of the time with a rolled
-camera. Same arguments, same files; rooms that are there already are kept.
+camera. With ``--plain`` the rooms have little texture, and in half of the views the camera is where one
+holds a phone standing or sitting, and looks about. Same arguments, same files; rooms that are there
+already are kept.
 
     python data_scripts/render_training_rooms.py OUT --rooms 30 --views 20 --first-seed 1000
 """
@@ -21,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from training_rooms import UP, varied_scene
+from training_rooms import UP, plain_scene, varied_scene
 
 from slamdepth.datasets.synth_render import Renderer
 from slamdepth.geometry import so3_exp
@@ -29,6 +31,8 @@ from slamdepth.types import Camera
 
 WIDTH, HEIGHT = 336, 252
 TEXEL_M = 0.004
+BLANK = 1.25  # a plain room's view of smaller relief is a piece of wall, which tells nothing
+HELD = 0.5  # share of a plain room's views
 TABLE_M = (0.6, 1.0)  # heights at which things stand on tables
 
 
@@ -43,11 +47,37 @@ def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndar
     return T
 
 
-def room_views(seed: int, count: int, focal_px: float) -> list[tuple[np.ndarray, np.ndarray]]:
+def aimed(
+    points: np.ndarray, on_tables: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the camera is and what it looks at: some thing, from any side."""
+    at_table = len(on_tables) > 0 and rng.random() < 0.5
+    among = on_tables if at_table else points
+    target = among[rng.integers(len(among))] + rng.normal(0, 0.25, 3)
+    distance = np.exp(rng.uniform(np.log(0.4), np.log(2.0 if at_table else 4.0)))
+    steepest = 80.0 if rng.random() < 0.5 else 40.0
+    elevation, azimuth = np.radians(rng.uniform(-8.0, steepest)), rng.uniform(-np.pi, np.pi)
+    direction = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
+    position = target + distance * direction / np.linalg.norm(direction)
+    return position, target
+
+
+def held(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The same of somebody who films a room."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    position = np.append(rng.uniform(low[:2], high[:2]), rng.uniform(0.9, 1.8))
+    elevation, azimuth = np.radians(rng.normal(-10.0, 13.0)), rng.uniform(-np.pi, np.pi)
+    forward = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
+    return position, position + forward
+
+
+def room_views(
+    seed: int, count: int, focal_px: float, *, plain: bool = False
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """``count`` pairs of image ``(H, W, 3)`` uint8 RGB and depth ``(H, W)`` metres of one room."""
     camera = Camera(WIDTH, HEIGHT, focal_px, focal_px, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
     rng = np.random.default_rng([seed, 11])
-    scene = varied_scene(seed)
+    scene = plain_scene(seed) if plain else varied_scene(seed)
     renderer = Renderer(scene, camera, TEXEL_M, seed)
     points = np.concatenate([s.points[::8, ::8].reshape(-1, 3) for s in scene.surfaces])
     on_tables = points[(points[:, 2] > TABLE_M[0]) & (points[:, 2] < TABLE_M[1])]
@@ -56,22 +86,19 @@ def room_views(seed: int, count: int, focal_px: float) -> list[tuple[np.ndarray,
     for _ in range(60 * count):
         if len(views) == count:
             break
-        at_table = len(on_tables) > 0 and rng.random() < 0.5
-        among = on_tables if at_table else points
-        target = among[rng.integers(len(among))] + rng.normal(0, 0.25, 3)
-        distance = np.exp(rng.uniform(np.log(0.4), np.log(2.0 if at_table else 4.0)))
-        steepest = 80.0 if rng.random() < 0.5 else 40.0
-        elevation, azimuth = np.radians(rng.uniform(-8.0, steepest)), rng.uniform(-np.pi, np.pi)
-        direction = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
-        position = target + distance * direction / np.linalg.norm(direction)
+        is_held = plain and rng.random() < HELD
+        position, target = held(points, rng) if is_held else aimed(points, on_tables, rng)
         if (position < low + 0.25).any() or (position > high - 0.2).any():
             continue
-        roll = rng.uniform(-60.0, 60.0) if rng.random() < 0.5 else rng.normal(0.0, 5.0)
+        rolled = not is_held and rng.random() < 0.5
+        roll = rng.uniform(-60.0, 60.0) if rolled else rng.normal(0.0, 5.0)
         T_world_camera = look_at(position, target, UP)
         T_world_camera[:3, :3] @= so3_exp(np.array([0.0, 0.0, np.radians(roll)]))
         depth = renderer.depth(T_world_camera)
         known = depth[(depth > 0) & np.isfinite(depth)]
         if len(known) < depth.size or np.percentile(known, 1) < 0.2 or known.max() > 12:
+            continue
+        if plain and np.percentile(known, 95) < BLANK * np.percentile(known, 5):
             continue
         colour, depth = renderer.render(T_world_camera)
         noise = rng.normal(0, rng.uniform(0, 3), colour.shape)
@@ -87,6 +114,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--focal-px", type=float, default=265.0, help=f"at {WIDTH} x {HEIGHT} pixels")
+    parser.add_argument("--plain", action="store_true", help="little texture, half of it as held by hand")
     arguments = parser.parse_args()
     folder, focal_px = arguments.output, arguments.focal_px
     folder.mkdir(parents=True, exist_ok=True)
@@ -96,7 +124,7 @@ def main() -> None:
     for room in range(arguments.rooms):
         done = folder / f".{room:05d}.done"
         if not done.exists():
-            pairs = room_views(arguments.first_seed + room, arguments.views, focal_px)
+            pairs = room_views(arguments.first_seed + room, arguments.views, focal_px, plain=arguments.plain)
             for index, (image, depth) in enumerate(pairs):
                 name = folder / f"{room * 1000 + index:05d}"
                 cv2.imwrite(f"{name}.png", np.clip(np.round(depth * 1000), 0, 65535).astype(np.uint16))

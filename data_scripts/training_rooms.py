@@ -22,6 +22,7 @@ from slamdepth.geometry import so3_exp
 
 UP = np.array([0.0, 0.0, 1.0])
 _GROUPS = ("desk", "bookshelf", "sofa", "cabinet", "rug_and_table", "plant", "corners")
+_WALL_M = 2.2  # what is longer is wall, floor or ceiling
 _REPAINTED = 0.3  # share of a group's surfaces that get another material
 _DARK, _PALE = paint.plain((0.07, 0.07, 0.08), contrast=0.06), paint.plain((0.86, 0.85, 0.83))
 
@@ -53,6 +54,33 @@ def varied_scene(seed: int) -> synth_scene.Scene:
         place = np.append(rng.uniform(0.08, 0.92, 2) * room[:2], 0.0)
         surfaces += [moved(s, np.eye(3), place) for s in _block(rng, 0.3)]
     return synth_scene.Scene(surfaces, _lamps(rng, seed, stretch))
+
+
+def plain_scene(seed: int) -> synth_scene.Scene:
+    """Room ``seed`` as offices and new flats are: walls white, much of the rest of one colour.
+
+    How much is drawn by room, from a third of all surfaces to all of them; what glows stays.
+    """
+    rng = np.random.default_rng([seed, 17])
+    scene = varied_scene(seed)
+    share = rng.uniform(0.3, 1.0)
+    wall = paint.plain(_grey(rng, 0.6, 0.95), contrast=rng.uniform(0.0, 0.03))
+
+    floor = rng.random() < 0.4
+
+    def repainted(surface: Surface) -> Surface:
+        size_m = np.ptp(surface.points.reshape(-1, 3), axis=0)
+        large = size_m.max() > _WALL_M and (floor or surface.points[..., 2].max() > 0.0)
+        if surface.emission > 0 or (rng.random() > share and not large):
+            return surface
+        kind = rng.random()
+        if large or kind < 0.3:
+            return replace(surface, paint=wall)
+        if kind < 0.6:
+            return replace(surface, paint=paint.muted(surface.paint, rng.uniform(0.0, 0.3)))
+        return replace(surface, paint=paint.plain(_grey(rng), contrast=rng.uniform(0.0, 0.03)))
+
+    return replace(scene, surfaces=[repainted(s) for s in scene.surfaces])
 
 
 def moved(surface: Surface, A: np.ndarray, t: np.ndarray) -> Surface:
