@@ -53,10 +53,14 @@ class _Waiting:
     keyframe: MapKeyframe
     frames_left: int
     words: Future[NDArray[np.float32]]
-    stages: list[Callable[[_Waiting], Floats | None]]  # still to come
+    stages: list[_Stage]  # still to come
     is_born: bool = False
     neighbours: list[int] = field(default_factory=list)
     adjustment: Adjustment | None = None
+
+
+_Stage = Callable[[_Waiting], "Floats | None"]
+"""Returns what the metres of each keyframe were multiplied by, where a loop was closed."""
 
 
 @dataclass
@@ -147,7 +151,13 @@ class Keyframes:
         self._rule.keyframe_made()
         delay = 0 if self._depth.is_instant(frame) else self._config.tracking.depth_delay
         words = self._side.ask(self._loops.describe, keyframe.features)
-        stages = [self._give_birth, self._search_on, self._let_adjust, self._take_over, self._close_loops]
+        stages: list[_Stage] = [
+            self._give_birth,
+            self._search_on,
+            self._let_adjust,
+            self._take_over,
+            self._close_loops,
+        ]
         self._waiting.append(_Waiting(keyframe, delay, words, stages))
         if len(self._map.keyframes) <= _WAITED_FOR:
             self.join()

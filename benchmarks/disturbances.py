@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sequence made harder, or another one: mirrored, backwards, small, dark, with gaps.
+
+What is mirrored or played backwards is a new sequence with a known trajectory; the others are the
+troubles that real recordings have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slamdepth.datasets import Dataset
+from slamdepth.types import Camera, Frame, Trajectory
+
+_MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+_CUT = 0.7
+_BLACK_FRAMES = 60  # two seconds
+
+
+def _same(thing: Any) -> Any:
+    return thing
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What is done to every frame.
+
+    Attributes:
+        camera: of the disturbed frames.
+        pixels: of an image or depth map; its shape follows the camera.
+        light: what happens to a colour image at position n of ``count``.
+        is_dropped: whether frame n is missing.
+        has_depth: whether a sensor's depth of frame n is there.
+        truth: of the disturbed sequence.
+        backwards: last frame first.
+    """
+
+    camera: Callable[[Camera], Camera] = _same
+    pixels: Callable[[NDArray[Any]], NDArray[Any]] = _same
+    light: Callable[[NDArray[np.uint8], int, int], NDArray[np.uint8]] = lambda image, n, count: image
+    is_dropped: Callable[[int], bool] = lambda n: False
+    has_depth: Callable[[int], bool] = lambda n: True
+    truth: Callable[[Trajectory], Trajectory] = _same
+    backwards: bool = False
+
+    def play(self, dataset: Dataset, count: int, *, with_depth: bool) -> Iterator[Frame]:
+        """The first ``count`` frames, disturbed, numbered anew; errors as of ``Dataset.read``."""
+        camera = self.camera(dataset.camera)
+        for n in range(count):
+            if self.is_dropped(n):
+                continue
+            frame = dataset.read(count - 1 - n if self.backwards else n, with_depth=with_depth)
+            image = self.light(np.ascontiguousarray(self.pixels(frame.image_rgb)), n, count)
+            depth_m = None
+            if frame.depth_m is not None and self.has_depth(n):
+                depth_m = np.ascontiguousarray(self.pixels(frame.depth_m))
+            time_s = -frame.timestamp_s if self.backwards else frame.timestamp_s
+            yield Frame(n, time_s, image, camera, depth_m)
+
+
+def mirrored_camera(camera: Camera) -> Camera:
+    """The camera that sees a mirrored world as ``camera`` sees the world, left and right exchanged."""
+    k1, k2, p1, p2, k3 = camera.distortion
+    return replace(camera, cx=camera.width - 1 - camera.cx, distortion=(k1, k2, p1, -p2, k3))
+
+
+def mirrored_truth(truth: Trajectory) -> Trajectory:
+    """Poses in the world mirrored in x."""
+    return Trajectory(truth.timestamps_s, _MIRROR @ truth.T_world_camera @ _MIRROR)
+
+
+def backward_truth(truth: Trajectory) -> Trajectory:
+    """The same poses at negative times."""
+    return Trajectory(-truth.timestamps_s[::-1], truth.T_world_camera[::-1])
+
+
+def _half(pixels: NDArray[Any]) -> NDArray[Any]:
+    size = (pixels.shape[1] // 2, pixels.shape[0] // 2)
+    how = cv2.INTER_AREA if pixels.ndim == 3 else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(pixels, size, interpolation=how))
+
+
+def _cut_edges(length: int) -> tuple[int, int]:
+    kept = round(_CUT * length)
+    return (length - kept) // 2, (length - kept) // 2 + kept
+
+
+def _middle(pixels: NDArray[Any]) -> NDArray[Any]:
+    (top, bottom), (left, right) = map(_cut_edges, pixels.shape[:2])
+    return pixels[top:bottom, left:right]
+
+
+def _middle_camera(camera: Camera) -> Camera:
+    (top, bottom), (left, right) = _cut_edges(camera.height), _cut_edges(camera.width)
+    return replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
+
+
+def _noisy(image: NDArray[np.uint8], n: int, grey: float) -> NDArray[np.uint8]:
+    noise = np.random.default_rng(n).normal(0.0, grey, image.shape)
+    return np.clip(image + noise, 0, 255).astype(np.uint8)
+
+
+def _brighter(image: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
+    return np.clip(image * factor, 0, 255).astype(np.uint8)
+
+
+def _black(image: NDArray[np.uint8], now: bool) -> NDArray[np.uint8]:
+    return np.zeros_like(image) if now else image
+
+
+def _with_bar(image: NDArray[np.uint8], n: int) -> NDArray[np.uint8]:
+    """A grey bar as wide as half of the image that crosses it from left to right every three seconds."""
+    width = image.shape[1]
+    left = (n * width // 60) % (width * 3 // 2) - width // 2
+    out = image.copy()
+    out[:, max(0, left) : max(0, left + width // 2)] = 60
+    return out
+
+
+DISTURBANCES: dict[str, Disturbance] = {
+    "as it is": Disturbance(),
+    "mirrored": Disturbance(
+        camera=mirrored_camera, pixels=lambda pixels: pixels[:, ::-1], truth=mirrored_truth
+    ),
+    "backwards": Disturbance(truth=backward_truth, backwards=True),
+    "half the pixels": Disturbance(
+        camera=lambda c: c.scaled(c.width // 2, c.height // 2), pixels=_half
+    ),
+    "a view of 70 %": Disturbance(camera=_middle_camera, pixels=_middle),
+    "noise of 10": Disturbance(light=lambda image, n, count: _noisy(image, n, 10.0)),
+    "a quarter of the light": Disturbance(
+        light=lambda image, n, count: _noisy(_brighter(image, 0.25), n, 3.0)
+    ),
+    "flickering light": Disturbance(light=lambda image, n, count: _brighter(image, 1 + 0.35 * np.sin(n / 4))),
+    "every 15th black": Disturbance(light=lambda image, n, count: _black(image, n % 15 == 7)),
+    "two seconds black": Disturbance(
+        light=lambda image, n, count: _black(image, count // 3 <= n < count // 3 + _BLACK_FRAMES)
+    ),
+    "gaps of 8 frames": Disturbance(is_dropped=lambda n: n % 90 >= 82),
+    "half hidden by a bar": Disturbance(light=lambda image, n, count: _with_bar(image, n)),
+    "depth of 4 in 7 frames": Disturbance(has_depth=lambda n: n % 7 >= 3),
+}  # fmt: skip
+"""By the name in the table."""

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmark of disturbed sequences: what is disturbed stays a sequence of its camera and its truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from made_up import MadeUpDataset, pose
+
+from benchmarks.disturbances import DISTURBANCES, mirrored_camera, mirrored_truth
+from benchmarks.disturbed import main
+from slamdepth.geometry import se3_exp
+from slamdepth.types import Camera, Trajectory
+
+CAMERA = Camera(64, 48, 50.0, 52.0, 30.0, 22.0, (0.2, -0.3, 0.01, -0.02, 0.1))
+
+
+def seen_px(camera: Camera, T_world_camera: np.ndarray, points_w: np.ndarray) -> np.ndarray:
+    T = np.linalg.inv(T_world_camera)
+    px, _ = cv2.projectPoints(
+        points_w, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], camera.K, camera.distortion_array
+    )
+    return px[:, 0]
+
+
+def test_a_mirrored_camera_sees_the_mirrored_world_as_its_image_shows_it() -> None:
+    rng = np.random.default_rng(0)
+    points_w = rng.uniform([-1, -1, 2], [1, 1, 4], (20, 3))
+    T = se3_exp(np.array([0.1, -0.2, 0.3, 0.05, 0.1, -0.2]))
+    mirrored = mirrored_truth(Trajectory(np.zeros(1), T[None])).T_world_camera[0]
+    assert np.linalg.det(mirrored[:3, :3]) == pytest.approx(1.0)
+    px = seen_px(CAMERA, T, points_w)
+    other = seen_px(mirrored_camera(CAMERA), mirrored, points_w * [-1, 1, 1])
+    np.testing.assert_allclose(other, np.stack([CAMERA.width - 1 - px[:, 0], px[:, 1]], axis=1), atol=1e-9)
+
+
+def made_up(count: int = 100) -> MadeUpDataset:
+    dataset = MadeUpDataset(count)
+    dataset.ground_truth = Trajectory(dataset.timestamps_s, np.stack([pose(0.1 * n) for n in range(count)]))
+    return dataset
+
+
+@pytest.mark.parametrize("name", DISTURBANCES)
+def test_frames_are_of_their_camera_and_time_goes_on(name: str) -> None:
+    dataset, disturbance = made_up(), DISTURBANCES[name]
+    camera = disturbance.camera(dataset.camera)
+    frames = list(disturbance.play(dataset, 100, with_depth=True))
+    truth = disturbance.truth(dataset.ground_truth)
+    assert (np.diff([f.timestamp_s for f in frames]) > 0).all()
+    assert (np.diff(truth.timestamps_s) > 0).all()
+    for frame in frames:
+        assert frame.camera == camera
+        assert frame.image_rgb.shape == (camera.height, camera.width, 3)
+        assert frame.image_rgb.flags.c_contiguous
+        if frame.depth_m is not None:
+            assert frame.depth_m.shape == (camera.height, camera.width)
+    at = np.searchsorted(truth.timestamps_s, frames[0].timestamp_s)
+    first = 99 if disturbance.backwards else 0
+    assert abs(truth.T_world_camera[at][0, 3]) == pytest.approx(0.1 * first)
+
+
+def test_what_is_taken_away() -> None:
+    dataset = made_up()
+    dropped = list(DISTURBANCES["gaps of 8 frames"].play(dataset, 100, with_depth=False))
+    assert [f.index for f in dropped] == [*range(82), *range(90, 100)]
+    black = list(DISTURBANCES["two seconds black"].play(dataset, 100, with_depth=False))
+    assert [f.index for f in black[1:] if not f.image_rgb.any()] == list(range(33, 93))
+    sparse = list(DISTURBANCES["depth of 4 in 7 frames"].play(dataset, 14, with_depth=True))
+    assert sum(f.depth_m is not None for f in sparse) == 8
+
+
+def test_a_short_run(tiny_room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = tmp_path / "disturbed.json"
+    wanted = ["--depth", "sensor", "--disturbances", "mirrored,backwards", "--max-frames", "30"]
+    assert main([str(tiny_room), *wanted, "--output", str(found)]) == 0
+    rows = json.loads(found.read_text(encoding="utf-8"))["rows"]
+    assert [row["disturbance"] for row in rows] == ["mirrored", "backwards"]
+    for row in rows:
+        assert row["tracked"] == 1.0
+        assert row["ate_se3_m"] < 0.02
+    assert "| mirrored | 100.0 |" in capsys.readouterr().out
+    assert str(tmp_path) not in found.read_text(encoding="utf-8")
+
+
+def test_bad_input_is_one_line(tiny_room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tiny_room), "--disturbances", "none"]) != 0
+    assert "no disturbance 'none'; there are: as it is, mirrored" in capsys.readouterr().err
+    assert main([str(tmp_path / "nowhere")]) != 0
+    assert capsys.readouterr().err.startswith("error: ")
