@@ -215,8 +215,11 @@ class Keyframes:
         self._rule.points_born()
 
     def _search_on(self, waiting: _Waiting) -> None:
+        self._search_and_adjust(waiting, waiting.neighbours[1::2])
+
+    def _search_and_adjust(self, waiting: _Waiting, neighbours: list[int]) -> None:
         with self._timed("mapping"):
-            self._mapper.search(waiting.keyframe, waiting.neighbours[1::2])
+            self._mapper.search(waiting.keyframe, neighbours)
         with self._timed("bundle"):
             waiting.adjustment = self._mapper.begin_window(waiting.keyframe)
 
@@ -264,10 +267,7 @@ class Keyframes:
 
     def _search_anew(self, waiting: _Waiting) -> None:
         """Tie the two sides of a loop together by what both see."""
-        with self._timed("mapping"):
-            self._mapper.search(waiting.keyframe, self._mapper.neighbours(waiting.keyframe))
-        with self._timed("bundle"):
-            waiting.adjustment = self._mapper.begin_window(waiting.keyframe)
+        self._search_and_adjust(waiting, self._mapper.neighbours(waiting.keyframe))
 
     def _tidy(self, waiting: _Waiting) -> None:
         with self._timed("mapping"):

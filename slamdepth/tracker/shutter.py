@@ -74,6 +74,14 @@ class Shutter:
         out[at] = inverse
         return out
 
+    def usual_inverse_depth(self, T_camera_world: Floats, point_ids: Ints) -> float:
+        """Median 1/m of the features ``point_ids (N,)`` whose map points are known; 0, which is far away,
+        where none is."""
+        rows = point_ids[point_ids >= 0]
+        return (
+            float(np.median(inverse_depth(T_camera_world, self._map.position_w[rows]))) if len(rows) else 0.0
+        )
+
     def correct_keyframe(self, keyframe: MapKeyframe) -> None:
         """Move a keyframe's keypoints by what is known now of its velocity, depth and readout time."""
         plain = self._plain(keyframe)

@@ -175,9 +175,7 @@ class Tracker:
         if not self._shutter.rolls or self._motion.last is None:
             return plain
         T_guess = self._motion.guess(frame.timestamp_s)
-        inverse = self._shutter.inverse_depth(T_guess, self._motion.last.point_ids)
-        # a frame placed by its depth alone may have no features at all: far away, then
-        usual = float(np.median(inverse)) if len(inverse) else 0.0
+        usual = self._shutter.usual_inverse_depth(T_guess, self._motion.last.point_ids)
         velocity = self._motion.velocity(frame.timestamp_s, T_guess)
         return self._shutter.correct(plain, velocity, np.full(len(plain), usual))
 
