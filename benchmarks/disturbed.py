@@ -32,6 +32,18 @@ _HEADINGS = ("sequence", "depth", "disturbed", "tracked %", "ATE SE(3) m", "ATE 
              "keyframes", "loops", "relocalised")  # fmt: skip
 
 
+def opened(path: Path) -> Dataset:
+    """A sequence that can be scored.
+
+    Raises:
+        DatasetError: it is none, or has no ground truth.
+    """
+    dataset = open_dataset(path)
+    if dataset.ground_truth is None:
+        raise DatasetError(f"{dataset.path}: has no ground truth to score by; leave it out")
+    return dataset
+
+
 def run(dataset: Dataset, disturbance: Disturbance, depth: str, count: int) -> dict[str, Any]:
     """One run over the first ``count`` frames of a sequence with ground truth.
 
@@ -112,10 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parse(arguments)
     begun, ways = environment(), chosen(asked.disturbances)
     rows: list[dict[str, Any]] = []
-    for path in asked.sequences:
-        dataset = open_dataset(path)
-        if dataset.ground_truth is None:
-            raise DatasetError(f"{dataset.path}: has no ground truth to score by; leave it out")
+    for dataset in [opened(path) for path in asked.sequences]:
         count = min(len(dataset), asked.max_frames or len(dataset))
         for depth in asked.depth.split(","):
             if depth == "sensor" and not dataset.has_depth:
