@@ -72,6 +72,7 @@ TRIALS: dict[str, Trial] = {
     "DPT-like head": Trial(build=DptLikeHead),
     "normals too": Trial(loss=normals_too),
     "MSE * exp(1 - SSIM)": Trial(loss=mse_ssim),
+    "154 x 210 pixels": Trial({"view.rows": 154, "view.columns": 210}),
     "238 x 322 pixels": Trial({"view.rows": 238, "view.columns": 322}),
     "308 x 420 pixels": Trial({"view.rows": 308, "view.columns": 420}),
     "no dropout, little decay": Trial({"head.dropout": 0.0, "weight_decay": 0.05}),

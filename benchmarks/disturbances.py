@@ -36,7 +36,7 @@ class Disturbance:
         pixels: of an image or depth map; its shape follows the camera.
         light: what happens to a colour image at position n of ``count``.
         is_dropped: whether frame n is missing.
-        has_depth: whether a sensor's depth of frame n is there.
+        has_depth: whether a sensor's depth of frame n is there; None where nothing is done to it.
         truth: of the disturbed sequence.
         backwards: last frame first.
     """
@@ -45,7 +45,7 @@ class Disturbance:
     pixels: Callable[[NDArray[Any]], NDArray[Any]] = _same
     light: Callable[[NDArray[np.uint8], int, int], NDArray[np.uint8]] = lambda image, n, count: image
     is_dropped: Callable[[int], bool] = lambda n: False
-    has_depth: Callable[[int], bool] = lambda n: True
+    has_depth: Callable[[int], bool] | None = None
     truth: Callable[[Trajectory], Trajectory] = _same
     backwards: bool = False
 
@@ -58,7 +58,7 @@ class Disturbance:
             frame = dataset.read(count - 1 - n if self.backwards else n, with_depth=with_depth)
             image = self.light(np.ascontiguousarray(self.pixels(frame.image_rgb)), n, count)
             depth_m = None
-            if frame.depth_m is not None and self.has_depth(n):
+            if frame.depth_m is not None and (self.has_depth is None or self.has_depth(n)):
                 depth_m = np.ascontiguousarray(self.pixels(frame.depth_m))
             time_s = -frame.timestamp_s if self.backwards else frame.timestamp_s
             yield Frame(n, time_s, image, camera, depth_m)

@@ -130,6 +130,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if depth == "sensor" and not dataset.has_depth:
                 continue
             for name, disturbance in ways.items():
+                if disturbance.has_depth is not None and depth != "sensor":
+                    continue  # as it is, to a network
                 about = {"sequence": dataset.name, "depth": depth, "disturbance": name}
                 with Console(stderr=True).status(f"{dataset.name} [{depth}]: {name}"):
                     try:

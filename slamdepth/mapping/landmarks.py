@@ -61,7 +61,8 @@ class MapKeyframe:
 
 
 _LEAST_ROWS = 4096
-_NEAREST_M = 0.05
+NEAREST_M = 0.05
+"""What is nearer to a camera, or behind it, is not seen by it."""
 
 
 class LandmarkMap:
@@ -266,7 +267,7 @@ class LandmarkMap:
         at = at[self.observations[keyframe.point_ids[at]] >= observations]
         rows = keyframe.point_ids[at]
         z = transform(keyframe.T_camera_world, self.position_w[rows])[:, 2]
-        ok = z > _NEAREST_M
+        ok = z > NEAREST_M
         return at[ok], rows[ok], z[ok]
 
     def seen_by(self, keyframes: int) -> Ints:

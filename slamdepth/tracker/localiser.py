@@ -13,7 +13,7 @@ from slamdepth.frontend.features import Features, ScaleLevels
 from slamdepth.frontend.matching import best_matches
 from slamdepth.frontend.pose import pixel_covariance, pose_from_scratch, refine_pose
 from slamdepth.geometry import project, transform
-from slamdepth.mapping.landmarks import LandmarkMap
+from slamdepth.mapping.landmarks import NEAREST_M, LandmarkMap
 from slamdepth.types import Camera
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Localiser:
         px, z = project(camera, points_c)
         margin = 8.0
         ok = (
-            (z > 0.05)
+            (z > NEAREST_M)
             & (px[:, 0] > -margin)
             & (px[:, 0] < camera.width + margin)
             & (px[:, 1] > -margin)

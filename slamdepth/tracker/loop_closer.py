@@ -14,7 +14,7 @@ from slamdepth.backend.pose_graph import Edge, PoseGraphResult, optimise_pose_gr
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import invert, rotation_angle_rad, transform
-from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.mapping.landmarks import NEAREST_M, LandmarkMap, MapKeyframe
 from slamdepth.tracker.localiser import Localiser, Placement
 from slamdepth.tracker.refused_loops import STEP_SIGMAS, RefusedLoops
 
@@ -114,7 +114,7 @@ class LoopCloser:
         if not self._is_metric() and len(both) >= 10:
             there = transform(placement.T_camera_world, self._map.position_w[placement.point_ids[both]])[:, 2]
             here = transform(keyframe.T_camera_world, self._map.position_w[keyframe.point_ids[both]])[:, 2]
-            ok = (there > 0.05) & (here > 0.05)
+            ok = (there > NEAREST_M) & (here > NEAREST_M)
             if np.count_nonzero(ok) >= 10:
                 scale = float(np.exp(np.median(np.log(there[ok] / here[ok]))))
         return placement, scale

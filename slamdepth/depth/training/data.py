@@ -137,8 +137,9 @@ def open_place(
 
 
 def data_folder(named: str) -> Path:
-    """An absolute folder as it is; another one below ``$SLAMDEPTH_DATA`` where that is
-    set, else relative to the current folder. Environment variables and ``~`` are expanded.
+    """The folder as it is named or, where there is none, below ``$SLAMDEPTH_DATA``, should that be set.
+
+    Environment variables and ``~`` are expanded.
 
     Raises:
         DatasetError: it does not exist.
