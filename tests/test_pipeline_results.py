@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from made_up import MadeUpDataset, pose
 
+from slamdepth.depth.alignment import as_given
 from slamdepth.pipeline.results import judge_trajectory, keyframe_trajectory, score_depth
 from slamdepth.types import DepthKind, DepthPrediction, Keyframe, Reconstruction, Trajectory
 
@@ -18,11 +19,10 @@ def keyframe(number: int, scale: float, *, is_sensor: bool = False) -> Keyframe:
         number,
         dataset.read(number),
         pose(number),
-        depth,
-        None,
         np.zeros((0, 2)),
         1.0,
         DepthPrediction(depth, DepthKind.METRIC, is_sensor=is_sensor),
+        as_given,
     )
 
 

@@ -13,6 +13,7 @@ from made_up import MadeUpDataset, pose
 from tracking_scene import ConstantDepth
 
 from slamdepth.config import Config
+from slamdepth.depth.alignment import as_given
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.geometry import se3_exp
@@ -82,7 +83,7 @@ def room(
         frame = Frame(number, number / 10, np.zeros((240, 320, 3), np.uint8), CAMERA)
         prediction = DepthPrediction(depth_m, DepthKind.METRIC, is_sensor=is_sensor)
         T = np.linalg.inv(first) @ T_level_camera
-        keyframes.append(Keyframe(number, frame, T, depth_m, None, np.zeros((0, 2)), 1.0, prediction))
+        keyframes.append(Keyframe(number, frame, T, np.zeros((0, 2)), 1.0, prediction, as_given))
     return tuple(keyframes)
 
 

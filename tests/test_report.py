@@ -21,6 +21,7 @@ import pytest
 from rich.console import Console
 
 from slamdepth.config import Config
+from slamdepth.depth.alignment import as_given
 from slamdepth.errors import OutputError
 from slamdepth.evaluation import DepthScorer, score_trajectory
 from slamdepth.geometry import se3_exp
@@ -85,7 +86,7 @@ def keyframe(number: int, *, is_sensor: bool = False) -> Keyframe:
     frame = Frame(number * 10, 100.0 + number / 3, image, CAMERA, depth)
     prediction = DepthPrediction(depth, DepthKind.METRIC, is_sensor=is_sensor)
     pose = trajectory().T_world_camera[number * 10]
-    return Keyframe(number, frame, pose, depth, None, np.zeros((1, 2)), 1.0 + 0.1 * number, prediction)
+    return Keyframe(number, frame, pose, np.zeros((1, 2)), 1.0 + 0.1 * number, prediction, as_given)
 
 
 def full_data() -> ReportData:
@@ -365,7 +366,7 @@ def test_gallery_spreads_over_the_run_and_shows_the_sensor_beside_a_prediction()
     sensor = keyframe_gallery((keyframe(0, is_sensor=True),))
     assert sensor is not None
     assert [picture.sensor for picture in sensor.pictures] == [None]
-    unknown = replace(keyframe(0), depth_m=np.zeros((24, 32), np.float32))
+    unknown = replace(keyframe(0), in_metres=lambda prediction: np.zeros_like(prediction.values))
     assert keyframe_gallery((unknown,)) is not None
     assert keyframe_gallery(()) is None
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from slamdepth.config import MapConfig
+from slamdepth.depth.alignment import as_given
 from slamdepth.geometry import invert, se3_exp
 from slamdepth.mapping.fusion_depth import View, consistent_pixels, trusted_depth
 from slamdepth.mapping.tsdf import fuse_keyframes
@@ -51,12 +52,15 @@ def keyframe(
         id=number,
         frame=Frame(number, float(number), image, camera),
         T_world_camera=T_world_camera,
-        depth_m=depth,
-        sigma_log=None,
         keypoints_px=np.zeros((0, 2)),
         depth_scale=1.0,
         prediction=DepthPrediction(depth, DepthKind.METRIC, is_sensor=is_sensor),
+        in_metres=as_given,
     )
+
+
+def with_depth(kf: Keyframe, depth_m: np.ndarray) -> Keyframe:
+    return replace(kf, prediction=replace(kf.prediction, values=depth_m))
 
 
 def poses() -> list[np.ndarray]:
@@ -146,7 +150,7 @@ def test_flying_pixels_and_far_depth_are_dropped() -> None:
     depth[:, 80] = 2.0  # a mean of the two sides, as a sensor gives at an edge
     depth[10, 10] = np.nan
     depth[20, 20] = 9.0
-    trusted = trusted_depth(replace(keyframe(0, CAMERA, np.eye(4)), depth_m=depth), 4.0)
+    trusted = trusted_depth(with_depth(keyframe(0, CAMERA, np.eye(4)), depth), 4.0)
     assert (trusted[30:, 79:82] == 0).all()
     assert trusted[10, 10] == trusted[20, 20] == 0
     assert (trusted[30:, :79] == 1).all()
@@ -158,9 +162,9 @@ def test_unsure_predictions_are_dropped_and_unsure_sensors_are_not() -> None:
     kf = keyframe(0, CAMERA, np.eye(4), is_sensor=False)
     sigma = np.full((120, 160), 0.1, np.float32)
     sigma[:, :30] = 0.7
-    unsure = replace(kf, sigma_log=sigma)
+    unsure = replace(kf, prediction=replace(kf.prediction, sigma_log=sigma))
     assert (trusted_depth(unsure, 4.0)[:, :30] == 0).all()
-    measured = replace(unsure, prediction=replace(kf.prediction, is_sensor=True))
+    measured = replace(kf, prediction=replace(unsure.prediction, is_sensor=True))
     assert (trusted_depth(measured, 4.0)[:, :30] > 0).mean() > 0.9
 
 
@@ -170,9 +174,9 @@ def test_specks_are_removed() -> None:
     depth[:, 120:] = 0
     depth[50:60, 130:140] = 1.0
     with_speck = fuse_keyframes(
-        [replace(kf, depth_m=depth)], MapConfig(voxel_size_m=0.02, min_component_triangles=0)
+        [with_depth(kf, depth)], MapConfig(voxel_size_m=0.02, min_component_triangles=0)
     )
-    clean = fuse_keyframes([replace(kf, depth_m=depth)], SETTINGS)
+    clean = fuse_keyframes([with_depth(kf, depth)], SETTINGS)
     assert with_speck.vertices_m[:, 0].max() > 0.3
     on_speck = np.abs(with_speck.vertices_m[:, 2] - 1.0) < 0.05
     assert on_speck.any()
@@ -190,7 +194,7 @@ def test_memory_is_bounded_by_larger_voxels() -> None:
 def test_nothing_to_fuse_is_an_empty_mesh_with_a_note() -> None:
     assert fuse_keyframes([], SETTINGS).notes == ("no mesh: there are no keyframes",)
     kf = keyframe(0, CAMERA, np.eye(4))
-    blank = fuse_keyframes([replace(kf, depth_m=np.zeros_like(kf.depth_m))], SETTINGS)
+    blank = fuse_keyframes([with_depth(kf, np.zeros_like(kf.depth_m))], SETTINGS)
     assert blank.vertices_m.shape == blank.triangles.shape == blank.colors.shape == (0, 3)
     assert "no keyframe has depth" in blank.notes[0]
     too_small = fuse_keyframes([kf], MapConfig(voxel_size_m=0.1, min_component_triangles=10**6))

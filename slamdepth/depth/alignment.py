@@ -253,6 +253,11 @@ def coarse_correction(
     return np.asarray(coarse, np.float32)
 
 
+def as_given(prediction: DepthPrediction) -> NDArray[np.float32]:
+    """A prediction, or a sensor's depth, whose metres are the map's: ``(H, W)``, 0 = unknown."""
+    return prediction.values
+
+
 def corrected_depth(coarse: NDArray[np.float32], prediction: DepthPrediction) -> NDArray[np.float32]:
     """A prediction with the correction of :func:`coarse_correction`: metres of the map,
     ``(H, W)`` float32, 0 = unknown."""

@@ -11,18 +11,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.config import Config
+from slamdepth.depth.alignment import as_given
 from slamdepth.depth.base import DepthModel
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.registration import CloudOdometry, CloudOdometryConfig, depth_to_cloud
 from slamdepth.geometry import invert, project, transform
 from slamdepth.mapping.keyframe_store import KeyframeStore
 from slamdepth.tracker.checks import check_frame, model_for
-from slamdepth.tracker.final_keyframe import FinalKeyframe
 from slamdepth.tracker.threads import single_threaded
 from slamdepth.types import (
     Camera,
     DepthPrediction,
     Frame,
+    Keyframe,
     Reconstruction,
     StepResult,
     TrackingStatus,
@@ -43,9 +44,10 @@ class _Kept:
     prediction: DepthPrediction | None
     T_world_camera: Floats
 
-    def final(self, id: int) -> FinalKeyframe:
+    def final(self, id: int) -> Keyframe:
         assert self.prediction is not None
-        return FinalKeyframe.of(id, self.frame, self.prediction, self.T_world_camera, np.zeros((0, 2)))
+        no_features = np.zeros((0, 2))
+        return Keyframe(id, self.frame, self.T_world_camera, no_features, 1.0, self.prediction, as_given)
 
 
 class CloudTracker:

@@ -7,16 +7,16 @@ import logging
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slamdepth.config import Config
-from slamdepth.depth.alignment import coarse_correction
+from slamdepth.depth.alignment import as_given, coarse_correction, corrected_depth
 from slamdepth.depth.robust_centre import robust_centre
 from slamdepth.geometry import invert
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
-from slamdepth.tracker.final_keyframe import FinalKeyframe
 from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.map_adjuster import MapAdjuster
@@ -173,16 +173,17 @@ def build_reconstruction(
 def _final(keyframe: MapKeyframe, mapper: LocalMapper) -> Keyframe:
     stored = keyframe.prediction
     assert stored is not None
-    correction = None
+    in_metres = as_given
     if not stored.is_sensor:
         prediction = replace(stored)  # read once, should it lie on disk
-        correction = coarse_correction(mapper.depth_field(keyframe, prediction), prediction)
-    return FinalKeyframe.of(
+        coarse = coarse_correction(mapper.depth_field(keyframe, prediction), prediction)
+        in_metres = partial(corrected_depth, coarse)
+    return Keyframe(
         keyframe.id,
         keyframe.frame,
-        stored,
         invert(keyframe.T_camera_world),
         keyframe.features.raw_px,
         keyframe.scale,
-        correction,
+        stored,
+        in_metres,
     )
