@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 from tracking_scene import CAMERA, CONFIG, COUNT, ConstantDepth, Run, ate_m, colour_only, frames
 
 from slamdepth.backend.bundle import BundleResult
@@ -23,6 +24,7 @@ from slamdepth.geometry import invert, se3_exp, so3_exp, transform
 from slamdepth.mapping.landmarks import MapKeyframe
 from slamdepth.tracker import Tracker, side_thread
 from slamdepth.tracker.keyframes import Moved
+from slamdepth.tracker.prepare import load_libraries
 from slamdepth.tracker.threads import single_threaded
 from slamdepth.types import DepthPrediction, Frame, Reconstruction, TrackingStatus
 
@@ -105,24 +107,53 @@ def test_a_keyframe_made_while_a_window_is_adjusted_moves_along() -> None:
     np.testing.assert_allclose(made.T_camera_world @ newest.T_world_camera, T_made_newest, atol=1e-12)
 
 
-def test_the_number_of_threads_is_set_back_by_the_last_to_leave() -> None:
-    cv2.setNumThreads(2)
-    inside, leave = threading.Event(), threading.Event()
+class Inside:
+    """A thread that is inside ``single_threaded`` until it is told to leave."""
 
-    def other() -> None:
+    def __init__(self) -> None:
+        self._inside, self._leave = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._stay)
+
+    def _stay(self) -> None:
         with single_threaded():
-            inside.set()
-            leave.wait(10.0)
+            self._inside.set()
+            self._leave.wait(10.0)
 
-    thread = threading.Thread(target=other)
-    with single_threaded():
-        thread.start()
-        assert inside.wait(10.0)
-        assert cv2.getNumThreads() == 1
-    assert cv2.getNumThreads() == 1
-    leave.set()
-    thread.join()
-    assert cv2.getNumThreads() == 2
+    def enter(self) -> None:
+        self._thread.start()
+        assert self._inside.wait(10.0)
+
+    def leave(self) -> None:
+        self._leave.set()
+        self._thread.join()
+
+
+def numbers_of_threads() -> list[int]:
+    blas = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+    assert blas
+    return [cv2.getNumThreads(), *blas]
+
+
+@pytest.mark.parametrize("first_to_leave", [0, 1])
+def test_whoever_enters_first_and_leaves_last_only_one_thread_computes(first_to_leave: int) -> None:
+    """By its number of threads OpenBLAS sums in another order: trajectories would differ in the last bits."""
+    load_libraries()
+    cv2.setNumThreads(2)
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = numbers_of_threads()
+        with single_threaded():
+            assert set(numbers_of_threads()) == {1}
+        for _ in range(2):
+            others = [Inside(), Inside()]
+            others[0].enter()
+            assert set(numbers_of_threads()) == {1}
+            others[1].enter()
+            with single_threaded():
+                others[first_to_leave].leave()
+                assert set(numbers_of_threads()) == {1}
+            assert set(numbers_of_threads()) == {1}
+            others[1 - first_to_leave].leave()
+            assert numbers_of_threads() == before
 
 
 def test_frames_prepared_ahead_change_nothing() -> None:

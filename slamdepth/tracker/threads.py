@@ -22,6 +22,17 @@ def _controller() -> Any:
     return ThreadpoolController()
 
 
+def _take_control() -> None:
+    """Make the calling thread the one that threadpoolctl lets set OpenBLAS' number of threads.
+
+    From 3.8 on the first thread that sets it is the only one that may, and others do nothing without a
+    word; here the first to enter and the last to leave may be two threads.
+    """
+    for library in _controller().lib_controllers:
+        if hasattr(library, "clear_controlling_thread"):
+            library.clear_controlling_thread(force=True)
+
+
 @contextmanager
 def single_threaded() -> Iterator[None]:
     """Limit OpenCV, and NumPy's and SciPy's BLAS, to one thread while any thread is inside.
@@ -35,6 +46,7 @@ def single_threaded() -> Iterator[None]:
     global _inside, _limit, _opencv_threads
     with _lock:
         if _inside == 0:
+            _take_control()
             _limit = _controller().limit(limits=1, user_api="blas")
             _opencv_threads = cv2.getNumThreads()
             cv2.setNumThreads(1)
@@ -45,6 +57,7 @@ def single_threaded() -> Iterator[None]:
         with _lock:
             _inside -= 1
             if _inside == 0:
+                _take_control()
                 _limit.restore_original_limits()
                 cv2.setNumThreads(_opencv_threads)
 
