@@ -69,7 +69,7 @@ def test_a_slow_network_changes_nothing(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_slow_work_beside_changes_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Adjustments, readout times and words are taken at frames that do not depend on their speed."""
+    """Adjustments, readout times, words and the growing map are taken at frames, however slow they are."""
     _, expected = prompt()
     random, at_once, names = np.random.default_rng(seed), side_thread._alone, set()
 
@@ -80,7 +80,7 @@ def test_slow_work_beside_changes_nothing(seed: int, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(side_thread, "_alone", late)
     made = Run(frames(change=colour_only), LateDepth(0, 0.0)).finish()
-    assert names == {"slamdepth-side_0"}
+    assert names == {"slamdepth-side_0", "slamdepth-between_0"}
     np.testing.assert_array_equal(made.trajectory.T_world_camera, expected.trajectory.T_world_camera)
     np.testing.assert_array_equal(made.points_m, expected.points_m)
 

@@ -8,7 +8,8 @@ and the window is adjusted. Meanwhile another frame may become a keyframe. When 
 happens depends on the frames alone and not on how fast the network was, so the trajectory
 is the same on every machine.
 
-What follows the depth is spread over several frames, so that none of them takes long. The window is
+What follows the depth is spread over several frames, so that none of them takes long, and is done
+before the frame is placed, see :mod:`slamdepth.tracker.between_frames`. The window is
 adjusted in a thread beside, from a copy, and taken over two frames later; once more where a loop was closed.
 """
 

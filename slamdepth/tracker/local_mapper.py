@@ -113,11 +113,13 @@ class LocalMapper:
         else:
             prior, doubt = prior_log_depth_at(prediction, features.raw_px)
             keyframe.predicted_log_depth = depth
-            correction, sigma = self.depth_field(keyframe, keyframe.prediction).correction(
-                features.raw_px, np.nan_to_num(prior), np.nan_to_num(doubt, nan=1.0)
-            )
+            field = self.depth_field(keyframe, keyframe.prediction)
+            there = features.raw_px, np.nan_to_num(prior), np.nan_to_num(doubt, nan=1.0)
+            correction = field.mean(*there)
             keyframe.scale = float(np.exp(np.median(correction)))
             depth = prior + correction
+            new = np.flatnonzero((keyframe.point_ids < 0) & sure)
+            sigma[new] = field.correction(*(values[new] for values in there))[1]
         born = np.flatnonzero((keyframe.point_ids < 0) & sure & self._may_be_born(depth, sigma))
         if not prediction.is_sensor:
             keyframe.log_depth[born] = depth[born]

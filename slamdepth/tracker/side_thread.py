@@ -19,10 +19,13 @@ class SideThread:
 
     A function given to it must read nothing that the tracker changes meanwhile: then what it returns,
     taken at a frame that does not depend on how fast it was, is the same on every machine.
+
+    Args:
+        name: told by tools that list threads.
     """
 
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(1, "slamdepth-side")
+    def __init__(self, name: str = "side") -> None:
+        self._pool = ThreadPoolExecutor(1, f"slamdepth-{name}")
 
     def ask(self, function: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Start ``function``; the result is to be taken with ``result()``, which waits and raises."""

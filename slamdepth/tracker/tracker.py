@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,7 @@ from slamdepth.errors import TrackingError
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import invert
 from slamdepth.mapping.landmarks import LandmarkMap
+from slamdepth.tracker.between_frames import BetweenFrames
 from slamdepth.tracker.checks import check_frame, model_for
 from slamdepth.tracker.depth_thread import DepthThread
 from slamdepth.tracker.finder import Finder
@@ -109,6 +111,7 @@ class Tracker:
             self._join,
             self._depth_of,
         )
+        self._between = BetweenFrames()
         self._frames = 0
         self._finished = False
         load_libraries()
@@ -119,6 +122,8 @@ class Tracker:
 
     def step(self, frame: Frame, prepared: Prepared | None = None) -> StepResult:
         """Place the next frame.
+
+        What the map needs before the frame after it goes on in a thread when this returns.
 
         Args:
             frame: later than all before; taken by ``self.camera``.
@@ -133,10 +138,16 @@ class Tracker:
             CameraError: the frame was taken by another camera.
         """
         check_frame(frame, self.camera, self._motion.last_time_s, self._finished)
-        self._watch.next_frame()
         with single_threaded():
-            result = self._step(frame, prepared or self.prepare(frame))
+            prepared = prepared or self.prepare(frame)
+            self._between.wait()
+            result = self._step(frame, prepared)
         self._motion.last_time_s = frame.timestamp_s
+        self._watch.next_frame()
+        if self._map.keyframes:
+            self._keyframes.count_frame()
+            if self._keyframes.is_due:
+                self._between.begin(partial(self._join, stages=1))
         return result
 
     def _step(self, frame: Frame, prepared: Prepared) -> StepResult:
@@ -145,9 +156,6 @@ class Tracker:
         self._watch.add("features", prepared.took_ms)
         if not self._map.keyframes:
             return self._start(frame, plain)
-        self._keyframes.count_frame()
-        if self._keyframes.is_due:
-            self._join(stages=1)
         if not self._keyframes.is_adjusting:
             self._forget_points()
         with self._watch.timed("tracking"):
@@ -250,6 +258,7 @@ class Tracker:
 
     def held(self) -> HeldBytes:
         """How much memory keyframes, points and frames take by now."""
+        self._between.wait()
         return held_bytes(self._map, self._log, self._keyframes.store)
 
     def finish(self) -> Reconstruction:
@@ -260,6 +269,7 @@ class Tracker:
         """
         if self._finished:
             raise TrackingError("this tracker has finished already")
+        self._between.wait()
         if not self._map.keyframes:
             raise TrackingError("no frame could be placed: too few features, or no depth")
         self._finished = True
@@ -286,4 +296,5 @@ class Tracker:
             )
             self._depth.close()
             self._side.close()
+            self._between.close()
             return made
