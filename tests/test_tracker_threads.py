@@ -24,7 +24,6 @@ from slamdepth.geometry import invert, se3_exp, so3_exp, transform
 from slamdepth.mapping.landmarks import MapKeyframe
 from slamdepth.tracker import Tracker, side_thread
 from slamdepth.tracker.keyframes import Moved
-from slamdepth.tracker.prepare import load_libraries
 from slamdepth.tracker.threads import single_threaded
 from slamdepth.types import DepthPrediction, Frame, Reconstruction, TrackingStatus
 
@@ -137,7 +136,8 @@ def numbers_of_threads() -> list[int]:
 @pytest.mark.parametrize("first_to_leave", [0, 1])
 def test_whoever_enters_first_and_leaves_last_only_one_thread_computes(first_to_leave: int) -> None:
     """By its number of threads OpenBLAS sums in another order: trajectories would differ in the last bits."""
-    load_libraries()
+    import scipy.linalg  # noqa: F401
+
     cv2.setNumThreads(2)
     with threadpool_limits(limits=2, user_api="blas"):
         before = numbers_of_threads()

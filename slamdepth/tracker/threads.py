@@ -17,6 +17,9 @@ _opencv_threads = 1
 
 @lru_cache(maxsize=1)
 def _controller() -> Any:
+    # it knows the libraries that are loaded by now
+    import cv2  # noqa: F401
+    import scipy.linalg  # noqa: F401
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
