@@ -271,6 +271,12 @@ def test_covisibility() -> None:
     assert landmarks.covisible(rows, 2) == [0, 2]
     assert landmarks.covisible(rows, 3, minimum=2) == [0, 2]
     assert landmarks.covisible(rows[:0], 3) == []
+    together = landmarks.covisibility()
+    np.testing.assert_array_equal(together, [[4, 1, 3], [1, 1, 0], [3, 0, 3]])
+    for k in landmarks.keyframes:
+        np.testing.assert_array_equal(together[k.id], landmarks.shared_points(k.point_ids))
+    np.testing.assert_array_equal(landmarks.times_seen(rows, 3), [2, 2, 2, 2])
+    np.testing.assert_array_equal(landmarks.times_seen(rows[2:], 2), [1, 2])
     np.testing.assert_array_equal(landmarks.points_of([1, 2]), rows)
     landmarks.kill(rows[:1])
     np.testing.assert_array_equal(landmarks.points_of([0, 1, 2]), rows[1:])

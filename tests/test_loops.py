@@ -361,6 +361,22 @@ def test_no_loop_between_two_places_that_only_look_alike() -> None:
     np.testing.assert_array_equal(np.stack([k.T_camera_world for k in world.map.keyframes]), poses)
 
 
+def test_a_keyframe_is_tied_to_those_it_shares_most_with_and_no_others() -> None:
+    """Walking through one room for hours would otherwise tie each keyframe to every other."""
+    world = World(3 * TURN, is_sensor=True)
+    edges = world.closer._odometry_edges()
+    together = world.map.covisibility()
+    for j in range(1, len(together)):
+        partners = [edge.i for edge in edges if edge.j == j]
+        others = np.setdiff1d(np.arange(j - 1), partners)
+        assert partners == sorted({j - 1, *partners})
+        assert len(partners) <= 11
+        assert all(together[j, i] >= 80 for i in partners[:-1])
+        if len(others) and len(partners) > 1:
+            assert together[j, others].max() <= max(together[j, partners[:-1]].min(), 79)
+    assert max(sum(edge.j == j for edge in edges) for j in range(len(together))) == 10
+
+
 def test_loops_can_be_switched_off() -> None:
     world = World(3, turn_drift=0.0, scale_drift=0.0, is_sensor=True)
     world.closer._config = Config.from_dict({"loops": {"enabled": False}})

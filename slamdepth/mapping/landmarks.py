@@ -247,6 +247,23 @@ class LandmarkMap:
         mask[-1] = False
         return np.array([np.count_nonzero(mask[k.point_ids]) for k in self.keyframes], dtype=np.int64)
 
+    def covisibility(self) -> Ints:
+        """How many points each two keyframes share, ``(K, K)``; each with itself: how many it sees."""
+        from scipy.sparse import csr_matrix
+
+        seen = [keyframe.point_ids[keyframe.point_ids >= 0] for keyframe in self.keyframes]
+        ends = np.concatenate([[0], np.cumsum([len(rows) for rows in seen])])
+        columns = np.concatenate(seen)
+        sees = csr_matrix((np.ones(len(columns), np.int64), columns, ends), shape=(len(seen), self.size))
+        return np.asarray((sees @ sees.T).toarray())
+
+    def times_seen(self, rows: Ints, before: int) -> Ints:
+        """By how many of the first ``before`` keyframes each of the points ``rows`` is seen, ``(N,)``."""
+        times = np.zeros(self.size + 1, dtype=np.int64)
+        for keyframe in self.keyframes[:before]:
+            times[keyframe.point_ids] += 1
+        return times[rows]
+
     def covisible(self, rows: Ints, limit: int, minimum: int = 1) -> list[int]:
         """Keyframes that see most of the points ``rows``, best first."""
         shared = self.shared_points(rows)

@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 
 _ALREADY_LINKED = 15  # shared points that make two keyframes neighbours
 _CANDIDATES = 2
+_COVISIBLE = 80  # shared points that make an edge of the pose graph
+_PARTNERS = 10  # earlier keyframes that one is tied to at most: the graph grows with the map alone
 _MIN_SCORE_SHARE = 0.6  # of the likeness of two neighbours in time
 _LOOSER = (2.0, 4.0, 8.0)  # the odometry's deviations, times this, once confirmed loops contradict them
 
@@ -176,7 +178,7 @@ class LoopCloser:
         return (0.01, 0.02, 0.03)
 
     def _odometry_edges(self, looser: float = 1.0) -> list[Edge]:
-        """Neighbours in time, and every pair that shares many points: what holds the graph's shape.
+        """Neighbours in time, and those that share most points: what holds the graph's shape.
 
         A keyframe's edges all come from the same observations, so each counts for its share only.
 
@@ -184,12 +186,12 @@ class LoopCloser:
             looser: factor on all deviations.
         """
         keyframes = self._map.keyframes
+        together = self._map.covisibility()
         edges = []
-        for j, keyframe in enumerate(keyframes):
-            shared = self._map.shared_points(keyframe.point_ids[keyframe.point_ids >= 0])[:j]
-            partners = set(np.flatnonzero(shared >= 80).tolist()) if j else set()
-            if j:
-                partners.add(j - 1)
+        for j, keyframe in enumerate(keyframes[1:], start=1):
+            shared = together[j, :j]
+            best = np.argsort(-shared, kind="stable")[:_PARTNERS]
+            partners = {j - 1, *best[shared[best] >= _COVISIBLE].tolist()}
             for i in sorted(partners):
                 T_i_j = keyframes[i].T_camera_world @ keyframe.T_world_camera
                 rotation, translation, log_scale = (s * looser * np.sqrt(len(partners)) for s in STEP_SIGMAS)
