@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _START_KEYFRAMES = 8  # until so many, most points are known by a predicted depth only
-_KNOWN_GROUND = 0.5  # of the points of a keyframe that three see, seen again
+_SHOWN_BY_ONE = 0.5  # of the points of an earlier keyframe that three see, seen again
+_SHOWN_BY_THREE = 0.7  # of the points a frame sees, seen by three earlier keyframes
 _RESCUE_STEP_M, _RESCUE_TURN_RAD = 0.1, 0.15  # between keyframes without features
 
 
@@ -60,16 +61,23 @@ class KeyframeRule:
         return placement.inliers < tracking.keyframe_min_inliers and still < 0.9 * self._overlap
 
     def _is_known_ground(self, placement: Placement) -> bool:
-        """Whether an earlier keyframe shows what the frame sees; the best such one is the reference then."""
+        """Whether one earlier keyframe, or three together, show what the frame sees; the best of them is the
+        reference then.
+
+        ORB-SLAM (Mur-Artal et al. 2015) calls such a keyframe redundant and removes it; this asks before.
+        """
         earlier = len(self._map.keyframes) - self._config.loops.min_gap
         if earlier <= 0 or placement.inliers < self._config.tracking.keyframe_min_inliers:
             return False
-        shared = self._map.shared_points(placement.point_ids)[:earlier]
+        rows = placement.point_ids[placement.point_ids >= 0]
+        shared = self._map.shared_points(rows)[:earlier]
         best = self._map.keyframes[int(np.argmax(shared))]
-        rows = best.point_ids[best.point_ids >= 0]
-        known = int(np.count_nonzero(self._map.observations[rows] >= 3))
-        if shared[best.id] < _KNOWN_GROUND * known:
-            return False
+        shown = best.point_ids[best.point_ids >= 0]
+        known = int(np.count_nonzero(self._map.observations[shown] >= 3))
+        if shared[best.id] < _SHOWN_BY_ONE * known:
+            by_three = int(np.count_nonzero(self._map.times_seen(rows, earlier) >= 3))
+            if by_three < _SHOWN_BY_THREE * len(rows):
+                return False
         self._reference, self._overlap = best, float(shared[best.id])
         return True
 
