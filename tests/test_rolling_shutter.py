@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tracking_scene import CAMERA, CONFIG, Run, ate_m, frames
+from tracking_scene import CAMERA, CONFIG, Run, ate_m, frames, played
 
 from slamdepth.config import Config, ShutterConfig
 from slamdepth.depth.sensor import SensorDepth
@@ -211,3 +211,16 @@ def test_a_phone_held_upright_rolls_along_the_width(rolling_frames: list[Frame])
 def test_a_global_shutter_is_recognised() -> None:
     found = tracked(frames(change=lambda frame: shaken(frame, 0.0)))
     assert abs(found.readout_s or 0.0) < 0.004
+
+
+@pytest.mark.parametrize("cut", [30, 44])
+def test_a_cut_in_the_recording_is_no_motion(rolling_frames: list[Frame], cut: int) -> None:
+    """By the velocity of a leap from one place to another all rows would be elsewhere."""
+    config = Config.from_dict({**CONFIG.model_dump(), "shutter": {"readout_ms": 1e3 * READOUT_S}})
+    run = Run(played([*rolling_frames[:cut], *rolling_frames[:16]]), SensorDepth(), config)
+    for before, after in zip(run.results[:16], run.results[cut:], strict=True):
+        assert before.T_world_camera is not None
+        assert after.T_world_camera is not None
+        np.testing.assert_allclose(after.T_world_camera, before.T_world_camera, atol=0.04)
+    made = run.finish().trajectory.T_world_camera
+    np.testing.assert_allclose(made[cut:], made[:16], atol=0.03)

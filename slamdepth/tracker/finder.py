@@ -32,7 +32,7 @@ _RELOCALISATION_CANDIDATES = 4
 
 
 class Finder:
-    """Places frames: by the motion, by the last keyframe, by their depth, by places that look alike.
+    """Places frames: by the motion, by the last keyframe, by places that look alike, by their depth.
 
     Args:
         join: lets waiting keyframes have their depth and ``motion`` follow; None where none waits.
@@ -70,7 +70,8 @@ class Finder:
     def place(self, frame: Frame, features: Features) -> tuple[Placement | None, TrackingStatus]:
         """Where ``frame`` is, and how that was found out; None where nothing says it.
 
-        A lost camera's motion is forgotten; where it led to last is tried again for some frames.
+        A lost camera's motion is forgotten; where it led to last is tried again for some frames. So is the
+        motion of one found by what it sees alone: the recording may have been cut.
         """
         placement, status = self._try(frame, features)
         if placement is None:
@@ -92,23 +93,15 @@ class Finder:
                 return self._try(frame, features)
             placement = self._localiser.from_keyframe(features, len(self._map.keyframes) - 1)
             if placement is not None:
+                self._motion.last = None
                 return placement, TrackingStatus.TRACKING
-            placement = self._register(frame, features, T_guess)
-            if placement is not None:
-                return placement, TrackingStatus.RESCUED
         placement = self._relocalise(features)
         if placement is not None:
             self.relocalisations += 1
+            self._motion.last = None
             return placement, TrackingStatus.RELOCALISED
-        if self._motion.last is None and self._retry.is_due(
-            has_depth=self._depth.has_depth(frame),
-            is_instant=self._depth.is_instant(frame),
-            is_blank=len(features) == 0,
-        ):
-            placement = self._register(frame, features, self._retry.guess(), is_old=True)
-            if placement is not None:
-                return placement, TrackingStatus.RESCUED
-        return None, TrackingStatus.LOST
+        placement = self._rescued(frame, features)
+        return placement, TrackingStatus.LOST if placement is None else TrackingStatus.RESCUED
 
     def _relocalise(self, features: Features) -> Placement | None:
         answers = self._places.query(features.place_descriptors, top_k=_RELOCALISATION_CANDIDATES)
@@ -123,6 +116,18 @@ class Finder:
             if placement is not None:
                 return placement
         return None
+
+    def _rescued(self, frame: Frame, features: Features) -> Placement | None:
+        """By registration of its depth: last, as the clouds of two places fit sooner than their features."""
+        if self._motion.last is not None:
+            return self._register(frame, features, self._motion.guess(frame.timestamp_s))
+        if not self._retry.is_due(
+            has_depth=self._depth.has_depth(frame),
+            is_instant=self._depth.is_instant(frame),
+            is_blank=len(features) == 0,
+        ):
+            return None
+        return self._register(frame, features, self._retry.guess(), is_old=True)
 
     def _register(
         self, frame: Frame, features: Features, T_guess: Floats, *, is_old: bool = False

@@ -32,6 +32,7 @@ class _Placed:
     timestamp_s: float
     keyframe: int
     is_keyframe: bool
+    is_found_anew: bool
     T_camera_keyframe: NDArray[np.float64]
     rows: NDArray[np.int32]
     px: NDArray[np.float32]
@@ -63,11 +64,20 @@ class FrameLog:
         of_frames = ((p.T_camera_keyframe, p.rows, p.px, p.phase, p.sigma_px) for p in self._placed)
         return self._row_now.nbytes + sum(array.nbytes for arrays in of_frames for array in arrays)
 
-    def add(self, timestamp_s: float, features: Features, placement: Placement, is_keyframe: bool) -> None:
+    def add(
+        self,
+        timestamp_s: float,
+        features: Features,
+        placement: Placement,
+        is_keyframe: bool,
+        *,
+        is_found_anew: bool = False,
+    ) -> None:
         """Remember where a frame is, relative to a keyframe that sees the same.
 
         Args:
             features: as extracted, not yet corrected for a rolling shutter.
+            is_found_anew: that no motion leads to it from the frame before.
         """
         reference = self._map.keyframes[-1]
         if (
@@ -83,6 +93,7 @@ class FrameLog:
                 timestamp_s,
                 reference.id,
                 is_keyframe,
+                is_found_anew,
                 placement.T_camera_world @ reference.T_world_camera,
                 (placement.point_ids[at] + len(self._row_now)).astype(np.int32),
                 features.px[at].astype(np.float32),
@@ -127,12 +138,11 @@ class FrameLog:
         return None
 
     def _velocity(self, n: int) -> Floats:
-        """Central difference over the frames next to the ``n``-th, where they are near in time."""
-        here = self._placed[n].timestamp_s
+        """Central difference over the frames next to the ``n``-th, where the camera moved there from it."""
         ends = [n]
-        if n > 0 and here - self._placed[n - 1].timestamp_s < _MAX_GAP_S:
+        if self._moved_to(n):
             ends.insert(0, n - 1)
-        if n + 1 < len(self._placed) and self._placed[n + 1].timestamp_s - here < _MAX_GAP_S:
+        if self._moved_to(n + 1):
             ends.append(n + 1)
         first, last = self._placed[ends[0]], self._placed[ends[-1]]
         if first is last:
@@ -140,6 +150,12 @@ class FrameLog:
         return velocity_between(
             self.T_camera_world(first), self.T_camera_world(last), last.timestamp_s - first.timestamp_s
         )
+
+    def _moved_to(self, n: int) -> bool:
+        """Whether the ``n``-th frame and the one before tell how the camera moved."""
+        if not 0 < n < len(self._placed) or self._placed[n].is_found_anew:
+            return False
+        return self._placed[n].timestamp_s - self._placed[n - 1].timestamp_s < _MAX_GAP_S
 
     def refresh_velocities(self) -> None:
         """Tell every keyframe how it moved."""

@@ -50,6 +50,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_SETTLED = 0.8  # of a frame's points agree still; of frames that follow one another 0.92 and more
+
 
 class Tracker:
     """Monocular SLAM with a depth prior: feed frames to :meth:`step`, then :meth:`finish`.
@@ -164,6 +166,7 @@ class Tracker:
             if placement is None:
                 return self._result(frame, TrackingStatus.LOST, None, False)
             features, placement = self._settle(frame, plain, features, placement)
+        is_found_anew = self._motion.last is None
         is_keyframe = self._keyframes.wants(placement) and self._depth.has_depth(frame)
         if is_keyframe and self._keyframes.is_full:
             # the depth that is on its way longest comes first
@@ -175,7 +178,7 @@ class Tracker:
             self._motion.remember(frame.timestamp_s, before, placement)
         else:
             self._motion.remember(frame.timestamp_s, placement, placement)
-        self._log.add(frame.timestamp_s, plain, placement, is_keyframe)
+        self._log.add(frame.timestamp_s, plain, placement, is_keyframe, is_found_anew=is_found_anew)
         return self._result(frame, status, placement, is_keyframe)
 
     def _still(self, frame: Frame, plain: Features) -> Features:
@@ -190,13 +193,20 @@ class Tracker:
     def _settle(
         self, frame: Frame, plain: Features, features: Features, placement: Placement
     ) -> tuple[Features, Placement]:
-        """The same by the velocity of this very frame, and the frame placed by that."""
+        """The same by the velocity of this very frame, and the frame placed by that.
+
+        Where its points contradict that velocity, the recording was cut and the camera did not move there.
+        """
         if not self._shutter.rolls or self._motion.last is None:
             return features, placement
         T = placement.T_camera_world
         inverse = self._shutter.inverse_depth(T, placement.point_ids)
-        settled = self._shutter.correct(plain, self._motion.velocity(frame.timestamp_s, T), inverse)
-        return settled, self._localiser.settle(settled, placement)
+        corrected = self._shutter.correct(plain, self._motion.velocity(frame.timestamp_s, T), inverse)
+        settled = self._localiser.settle(corrected, placement)
+        if settled.inliers >= _SETTLED * placement.inliers:
+            return corrected, settled
+        self._motion.last = None
+        return plain, self._localiser.settle(plain, placement)
 
     def _join(self, *, until_born: bool = False, stages: int | None = None) -> Moved | None:
         """Let waiting keyframes have their depth, see ``Keyframes.join``, and follow the map."""
