@@ -39,6 +39,7 @@ class Disturbance:
         has_depth: whether a sensor's depth of frame n is there; None where nothing is done to it.
         truth: of the disturbed sequence.
         backwards: last frame first.
+        laps: how often it is played, one time after the other, with a cut between.
     """
 
     camera: Callable[[Camera], Camera] = _same
@@ -48,11 +49,14 @@ class Disturbance:
     has_depth: Callable[[int], bool] | None = None
     truth: Callable[[Trajectory], Trajectory] = _same
     backwards: bool = False
+    laps: int = 1
 
     def play(self, dataset: Dataset, count: int, *, with_depth: bool) -> Iterator[Frame]:
         """The first ``count`` frames, disturbed, numbered anew; errors as of ``Dataset.read``."""
         camera = self.camera(dataset.camera)
-        for n in range(count):
+        times_s = self._times_s(dataset, count)
+        for at in range(self.laps * count):
+            n = at % count
             if self.is_dropped(n):
                 continue
             frame = dataset.read(count - 1 - n if self.backwards else n, with_depth=with_depth)
@@ -60,8 +64,32 @@ class Disturbance:
             depth_m = None
             if frame.depth_m is not None and (self.has_depth is None or self.has_depth(n)):
                 depth_m = np.ascontiguousarray(self.pixels(frame.depth_m))
-            time_s = -frame.timestamp_s if self.backwards else frame.timestamp_s
-            yield Frame(n, time_s, image, camera, depth_m)
+            yield Frame(at, float(times_s[at]), image, camera, depth_m)
+
+    def _times_s(self, dataset: Dataset, count: int) -> NDArray[np.float64]:
+        """When each frame is played, ``(laps * count,)``."""
+        times_s = dataset.timestamps_s[:count]
+        if self.backwards:
+            times_s = -times_s[::-1]
+        return np.concatenate([times_s + lap * _lap_s(times_s) for lap in range(self.laps)])
+
+    def truth_of(self, dataset: Dataset, count: int) -> Trajectory:
+        """Poses at the times of what :meth:`play` yields of a sequence with ground truth."""
+        assert dataset.ground_truth is not None
+        truth = self.truth(dataset.ground_truth)
+        if self.laps == 1:
+            return truth
+        times_s = self._times_s(dataset, count)[:count]
+        lap = np.flatnonzero((truth.timestamps_s >= times_s[0]) & (truth.timestamps_s <= times_s[-1]))
+        return Trajectory(
+            np.concatenate([truth.timestamps_s[lap] + n * _lap_s(times_s) for n in range(self.laps)]),
+            np.tile(truth.T_world_camera[lap], (self.laps, 1, 1)),
+        )
+
+
+def _lap_s(times_s: NDArray[np.float64]) -> float:
+    """From the first frame of a lap to the first of the next, at the sequence's pace."""
+    return float(times_s[-1] - times_s[0]) * len(times_s) / max(len(times_s) - 1, 1)
 
 
 def mirrored_camera(camera: Camera) -> Camera:
@@ -143,6 +171,7 @@ DISTURBANCES: dict[str, Disturbance] = {
         light=lambda image, n, count: _black(image, count // 3 <= n < count // 3 + _BLACK_FRAMES)
     ),
     "gaps of 8 frames": Disturbance(is_dropped=lambda n: n % 90 >= 82),
+    "three times, with cuts": Disturbance(laps=3),
     "half hidden by a bar": Disturbance(light=lambda image, n, count: _with_bar(image, n)),
     "depth of 4 in 7 frames": Disturbance(has_depth=lambda n: n % 7 >= 3),
 }  # fmt: skip

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from slamdepth.io import write_json
 
 FORMAT = 1
 _HEADINGS = ("sequence", "depth", "disturbed", "tracked %", "ATE SE(3) m", "ATE Sim(3) m", "scale",
-             "keyframes", "loops", "relocalised")  # fmt: skip
+             "keyframes", "loops", "relocalised", "fps", "longest step ms", "finish s")  # fmt: skip
 
 
 def opened(path: Path) -> Dataset:
@@ -50,17 +51,22 @@ def run(dataset: Dataset, disturbance: Disturbance, depth: str, count: int) -> d
     Raises:
         DatasetError: too few poses can be scored.
     """
-    assert dataset.ground_truth is not None
     system = SlamDepth(disturbance.camera(dataset.camera), Config.from_dict({"depth": {"name": depth}}))
-    given = 0
+    steps_s: list[float] = []
     for frame in disturbance.play(dataset, count, with_depth=depth == "sensor"):
+        begun = time.perf_counter()
         system.step(frame)
-        given += 1
+        steps_s.append(time.perf_counter() - begun)
+    begun = time.perf_counter()
     found = system.finish()
-    score = score_trajectory(disturbance.truth(dataset.ground_truth), found.trajectory)
+    finish_s = time.perf_counter() - begun
+    score = score_trajectory(disturbance.truth_of(dataset, count), found.trajectory)
     return {
-        "frames": given,
-        "tracked": len(found.trajectory) / given,
+        "frames": len(steps_s),
+        "fps": len(steps_s) / (sum(steps_s) + finish_s),
+        "longest_step_ms": 1e3 * max(steps_s),
+        "finish_s": finish_s,
+        "tracked": len(found.trajectory) / len(steps_s),
         "ate_se3_m": score.se3.rmse_m,
         "ate_sim3_m": score.sim3.rmse_m,
         "scale": score.sim3.scale,
@@ -83,6 +89,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
     return [
         f"{100 * row['tracked']:.1f}", f"{row['ate_se3_m']:.3f}", f"{row['ate_sim3_m']:.3f}",
         f"{row['scale']:.3f}", *(str(row[name]) for name in ("keyframes", "loops", "relocalisations")),
+        f"{row['fps']:.1f}", f"{row['longest_step_ms']:.0f}", f"{row['finish_s']:.1f}",
     ]  # fmt: skip
 
 

@@ -49,7 +49,7 @@ def test_frames_are_of_their_camera_and_time_goes_on(name: str) -> None:
     dataset, disturbance = made_up(), DISTURBANCES[name]
     camera = disturbance.camera(dataset.camera)
     frames = list(disturbance.play(dataset, 100, with_depth=True))
-    truth = disturbance.truth(dataset.ground_truth)
+    truth = disturbance.truth_of(dataset, 100)
     assert (np.diff([f.timestamp_s for f in frames]) > 0).all()
     assert (np.diff(truth.timestamps_s) > 0).all()
     for frame in frames:
@@ -71,6 +71,17 @@ def test_what_is_taken_away() -> None:
     assert [f.index for f in black[1:] if not f.image_rgb.any()] == list(range(33, 93))
     sparse = list(DISTURBANCES["depth of 4 in 7 frames"].play(dataset, 14, with_depth=True))
     assert sum(f.depth_m is not None for f in sparse) == 8
+
+
+def test_laps_follow_one_another_at_the_pace_of_the_sequence() -> None:
+    dataset, laps = made_up(), DISTURBANCES["three times, with cuts"]
+    frames, truth = list(laps.play(dataset, 40, with_depth=False)), laps.truth_of(dataset, 40)
+    assert [f.index for f in frames] == list(range(120))
+    step_s = dataset.timestamps_s[1] - dataset.timestamps_s[0]
+    np.testing.assert_allclose(np.diff([f.timestamp_s for f in frames]), step_s)
+    np.testing.assert_allclose(truth.timestamps_s, [f.timestamp_s for f in frames])
+    np.testing.assert_array_equal(frames[85].image_rgb, frames[5].image_rgb)
+    np.testing.assert_array_equal(truth.T_world_camera[85], truth.T_world_camera[5])
 
 
 def test_a_short_run(tiny_room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
