@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -167,3 +168,28 @@ def test_the_guess_goes_on_for_two_steps_and_stops() -> None:
         retry.count_frame()
     D = retry.guess() @ np.linalg.inv(start)
     np.testing.assert_allclose(D[:3, 3], 2 * velocity[:3, 3], atol=1e-9)
+
+
+def test_a_place_that_looks_alike_is_asked_before_depth_is_registered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After a cut the depth of one place may well fit another's; hundreds of its features do not."""
+    run = Run(frames(range(40)))
+    tracker = run.tracker
+    newest = run.results[-1].keyframes - 1
+    by_keyframe = tracker._localiser.from_keyframe
+
+    def not_from_the_newest(features: Any, k: int, **how: Any) -> Any:
+        return None if k == newest else by_keyframe(features, k, **how)
+
+    def elsewhere(*_: Any, **__: Any) -> Any:
+        return se3_exp(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+    monkeypatch.setattr(tracker._localiser, "track", lambda *_: None)
+    monkeypatch.setattr(tracker._localiser, "from_keyframe", not_from_the_newest)
+    monkeypatch.setattr(tracker._finder._rescue, "place", elsewhere)
+    result = tracker.step(played(frames([*range(40), 2]))[-1])
+    assert result.status is TrackingStatus.RELOCALISED
+    assert result.T_world_camera is not None
+    np.testing.assert_allclose(result.T_world_camera, run.results[2].T_world_camera, atol=0.02)
+    assert np.array_equal(tracker._motion.step, np.eye(4))
