@@ -74,7 +74,7 @@ def test_what_is_taken_away() -> None:
 
 
 def test_laps_follow_one_another_at_the_pace_of_the_sequence() -> None:
-    dataset, laps = made_up(), DISTURBANCES["three times, with cuts"]
+    dataset, laps = made_up(), DISTURBANCES["three times over"]
     frames, truth = list(laps.play(dataset, 40, with_depth=False)), laps.truth_of(dataset, 40)
     assert [f.index for f in frames] == list(range(120))
     step_s = dataset.timestamps_s[1] - dataset.timestamps_s[0]
