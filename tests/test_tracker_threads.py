@@ -127,6 +127,17 @@ class Inside:
         self._thread.join()
 
 
+def test_the_number_of_threads_is_set_back_by_the_last_to_leave() -> None:
+    cv2.setNumThreads(2)
+    other = Inside()
+    with single_threaded():
+        other.enter()
+        assert cv2.getNumThreads() == 1
+    assert cv2.getNumThreads() == 1
+    other.leave()
+    assert cv2.getNumThreads() == 2
+
+
 def numbers_of_threads() -> list[int]:
     blas = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
     assert blas

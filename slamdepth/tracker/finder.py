@@ -70,8 +70,8 @@ class Finder:
     def place(self, frame: Frame, features: Features) -> tuple[Placement | None, TrackingStatus]:
         """Where ``frame`` is, and how that was found out; None where nothing says it.
 
-        A lost camera's motion is forgotten; where it led to last is tried again for some frames. So is the
-        motion of one found by what it sees alone: the recording may have been cut.
+        A lost camera's motion is forgotten; where it led to last is tried again for some frames. Forgotten is
+        also the motion of a camera found by what it sees alone: the recording may have been cut.
         """
         placement, status = self._try(frame, features)
         if placement is None:

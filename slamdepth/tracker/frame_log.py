@@ -138,7 +138,7 @@ class FrameLog:
         return None
 
     def _velocity(self, n: int) -> Floats:
-        """Central difference over the frames next to the ``n``-th, where the camera moved there from it."""
+        """Central difference over the frames before and after the ``n``-th, where the camera moved on."""
         ends = [n]
         if self._moved_to(n):
             ends.insert(0, n - 1)
@@ -152,7 +152,7 @@ class FrameLog:
         )
 
     def _moved_to(self, n: int) -> bool:
-        """Whether the ``n``-th frame and the one before tell how the camera moved."""
+        """Whether the camera moved to the ``n``-th frame from the one before, and not long before."""
         if not 0 < n < len(self._placed) or self._placed[n].is_found_anew:
             return False
         return self._placed[n].timestamp_s - self._placed[n - 1].timestamp_s < _MAX_GAP_S

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 _ALREADY_LINKED = 15  # shared points that make two keyframes neighbours
 _CANDIDATES = 2
 _COVISIBLE = 80  # shared points that make an edge of the pose graph
-_PARTNERS = 10  # earlier keyframes that one is tied to at most: the graph grows with the map alone
+_PARTNERS = 10  # earlier keyframes that one is tied to at most, beside the one just before it
 _MIN_SCORE_SHARE = 0.6  # of the likeness of two neighbours in time
 _LOOSER = (2.0, 4.0, 8.0)  # the odometry's deviations, times this, once confirmed loops contradict them
 
