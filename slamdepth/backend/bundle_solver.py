@@ -288,12 +288,19 @@ class Solver:
         """``Z Z^T`` over all points, ``(7 K, 7 K)``."""
         size = self.K * _CAM
         if size * self.P * 3 <= _DENSE_LIMIT:
-            dense = np.zeros((self.K, _CAM, 3, self.P))
+            # a pinned camera moves only its depth scale: its other rows are 0 and not worth the product
+            first = np.where(self.pinned, _CAM - 1, 0)
+            rows = np.flatnonzero(np.arange(_CAM) >= first[:, None])
+            ends = np.cumsum(_CAM - first)
+            dense = np.zeros((len(rows), 3, self.P))
             for slot, camera in enumerate(self.free.tolist()):
                 block = self.blocks[camera]
-                dense[slot][:, :, self.pt[block]] = Z[:, :, block]
-            flat = dense.reshape(size, 3 * self.P)
-            return flat @ flat.T
+                own = Z[first[slot] :, :, block]
+                dense[ends[slot] - len(own) : ends[slot]][:, :, self.pt[block]] = own
+            flat = dense.reshape(len(rows), 3 * self.P)
+            coupling = np.zeros((size, size))
+            coupling[np.ix_(rows, rows)] = flat @ flat.T
+            return coupling
         from scipy.sparse import bsr_matrix
 
         blocks = [self.blocks[camera] for camera in self.free.tolist()]
