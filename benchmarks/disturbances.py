@@ -171,6 +171,8 @@ DISTURBANCES: dict[str, Disturbance] = {
         light=lambda image, n, count: _black(image, count // 3 <= n < count // 3 + _BLACK_FRAMES)
     ),
     "gaps of 8 frames": Disturbance(is_dropped=lambda n: n % 90 >= 82),
+    "every third frame": Disturbance(is_dropped=lambda n: n % 3 > 0),
+    "begun at frame 50": Disturbance(is_dropped=lambda n: n < 50),
     "three times over": Disturbance(laps=3),
     "half hidden by a bar": Disturbance(light=lambda image, n, count: _with_bar(image, n)),
     "depth of 4 in 7 frames": Disturbance(has_depth=lambda n: n % 7 >= 3),

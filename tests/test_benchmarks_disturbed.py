@@ -59,7 +59,7 @@ def test_frames_are_of_their_camera_and_time_goes_on(name: str) -> None:
         if frame.depth_m is not None:
             assert frame.depth_m.shape == (camera.height, camera.width)
     at = np.searchsorted(truth.timestamps_s, frames[0].timestamp_s)
-    first = 99 if disturbance.backwards else 0
+    first = 99 if disturbance.backwards else frames[0].index
     assert abs(truth.T_world_camera[at][0, 3]) == pytest.approx(0.1 * first)
 
 
@@ -67,6 +67,10 @@ def test_what_is_taken_away() -> None:
     dataset = made_up()
     dropped = list(DISTURBANCES["gaps of 8 frames"].play(dataset, 100, with_depth=False))
     assert [f.index for f in dropped] == [*range(82), *range(90, 100)]
+    third = list(DISTURBANCES["every third frame"].play(dataset, 10, with_depth=False))
+    assert [f.index for f in third] == [0, 3, 6, 9]
+    later = list(DISTURBANCES["begun at frame 50"].play(dataset, 53, with_depth=False))
+    assert [f.index for f in later] == [50, 51, 52]
     black = list(DISTURBANCES["two seconds black"].play(dataset, 100, with_depth=False))
     assert [f.index for f in black[1:] if not f.image_rgb.any()] == list(range(33, 93))
     sparse = list(DISTURBANCES["depth of 4 in 7 frames"].play(dataset, 14, with_depth=True))
