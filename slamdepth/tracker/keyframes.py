@@ -9,8 +9,8 @@ happens depends on the frames alone and not on how fast the network was, so the 
 is the same on every machine.
 
 What follows the depth is spread over several frames, so that none of them takes long, and is done
-before the frame is placed, see :mod:`slamdepth.tracker.between_frames`. The window is
-adjusted in a thread beside, from a copy, and taken over two frames later; once more where a loop was closed.
+before the frame is placed, see :mod:`slamdepth.tracker.between_frames`. The window is adjusted in
+a thread beside, from a copy, and taken over three frames later; once more where a loop was closed.
 """
 
 from __future__ import annotations

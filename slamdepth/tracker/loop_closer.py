@@ -95,7 +95,7 @@ class LoopCloser:
     def close(self, keyframe: MapKeyframe, sightings: list[Sighting]) -> Correction | None:
         """Close the first of the loops that the pose graph believes; on success the map has been corrected.
 
-        Points may have been merged and keyframes adjusted since the loops were sighted, no more.
+        Since the loops were sighted keyframes may have been adjusted and points have died; none were merged.
         """
         for sighting in sightings:
             correction = self._correct(keyframe, sighting)
