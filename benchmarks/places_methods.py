@@ -143,9 +143,9 @@ def verified(places: Sequence[Place], camera: Camera, config: Config, min_gap: i
         allowed = set(earlier)
         found = []
         for k in closer.candidates(keyframe):
-            sighting = closer.verify(keyframe, k) if k in allowed else None
-            if sighting is not None:
-                found.append((k, float(np.count_nonzero(sighting.point_ids >= 0))))
+            placed = closer.verify(keyframe, k) if k in allowed else None
+            if placed is not None:
+                found.append((k, float(placed[0].inliers)))
         return found
 
     return answer

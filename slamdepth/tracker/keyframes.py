@@ -9,8 +9,8 @@ happens depends on the frames alone and not on how fast the network was, so the 
 is the same on every machine.
 
 What follows the depth is spread over several frames, so that none of them takes long, and is done
-before the frame is placed, see :mod:`slamdepth.tracker.between_frames`. The window is adjusted in
-a thread beside, from a copy, and taken over three frames later; once more where a loop was closed.
+before the frame is placed, see :mod:`slamdepth.tracker.between_frames`. The window is
+adjusted in a thread beside, from a copy, and taken over two frames later; once more where a loop was closed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from slamdepth.tracker.frame_log import FrameLog
 from slamdepth.tracker.keyframe_rule import KeyframeRule
 from slamdepth.tracker.local_mapper import LocalMapper
 from slamdepth.tracker.localiser import Placement
-from slamdepth.tracker.loop_closer import LoopCloser, Sighting
+from slamdepth.tracker.loop_closer import LoopCloser
 from slamdepth.tracker.map_adjuster import Adjustment, MapAdjuster
 from slamdepth.tracker.shutter import Shutter
 from slamdepth.tracker.side_thread import SideThread
@@ -58,7 +58,6 @@ class _Waiting:
     is_born: bool = False
     neighbours: list[int] = field(default_factory=list)
     adjustment: Adjustment | None = None
-    sightings: list[Sighting] = field(default_factory=list)
 
 
 _Stage = Callable[[_Waiting], "Floats | None"]
@@ -134,10 +133,9 @@ class Keyframes:
         return bool(self._waiting) and self._waiting[0].frames_left <= 0
 
     @property
-    def remembers_rows(self) -> bool:
-        """Whether an adjustment or a loop is on its way: the points have to keep their rows."""
-        oldest = self._waiting[0] if self._waiting else None
-        return oldest is not None and (oldest.adjustment is not None or bool(oldest.sightings))
+    def is_adjusting(self) -> bool:
+        """Whether an adjustment is on its way, which remembers rows of points."""
+        return bool(self._waiting) and self._waiting[0].adjustment is not None
 
     def count_frame(self) -> None:
         """Tell that another frame has come."""
@@ -157,9 +155,9 @@ class Keyframes:
         stages: list[_Stage] = [
             self._give_birth,
             self._search_on,
-            self._look_for_loops,
             self._let_adjust,
-            self._take_over_and_close,
+            self._take_over,
+            self._close_loops,
         ]
         self._waiting.append(_Waiting(keyframe, delay, words, stages))
         if len(self._map.keyframes) <= _WAITED_FOR:
@@ -234,12 +232,6 @@ class Keyframes:
         if self._shutter.rolls:
             self._shutter.correct_keyframe(keyframe)
 
-    def _look_for_loops(self, waiting: _Waiting) -> None:
-        """Meanwhile the thread beside adjusts."""
-        with self._timed("loops"):
-            self._loops.add(waiting.keyframe, waiting.words.result())
-            waiting.sightings = self._loops.sightings(waiting.keyframe)
-
     def _let_adjust(self, waiting: _Waiting) -> None:
         """Leave the thread beside a frame's time."""
 
@@ -262,14 +254,11 @@ class Keyframes:
             if is_new:
                 self._shutter.correct_keyframes()
 
-    def _take_over_and_close(self, waiting: _Waiting) -> Floats | None:
-        self._take_over(waiting)
-        return self._close_loops(waiting)
-
     def _close_loops(self, waiting: _Waiting) -> Floats | None:
-        sightings, waiting.sightings = waiting.sightings, []
+        keyframe = waiting.keyframe
         with self._timed("loops"):
-            correction = self._loops.close(waiting.keyframe, sightings)
+            self._loops.add(keyframe, waiting.words.result())
+            correction = self._loops.close(keyframe)
         if correction is None:
             self._tidy(waiting)
             return None

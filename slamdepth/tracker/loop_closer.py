@@ -29,7 +29,6 @@ _ALREADY_LINKED = 15  # shared points that make two keyframes neighbours
 _CANDIDATES = 2
 _COVISIBLE = 80  # shared points that make an edge of the pose graph
 _PARTNERS = 10  # earlier keyframes that one is tied to at most, beside the one just before it
-_FEWEST_FOR_SCALE = 10  # points that are in the map twice
 _MIN_SCORE_SHARE = 0.6  # of the likeness of two neighbours in time
 _LOOSER = (2.0, 4.0, 8.0)  # the odometry's deviations, times this, once confirmed loops contradict them
 
@@ -43,21 +42,6 @@ class Correction:
     """
 
     scales: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """A keyframe that sees the place of an earlier one, whatever the map says of where it is.
-
-    Attributes:
-        earlier: number of the earlier keyframe.
-        T_earlier_keyframe: ``(4, 4)`` where the points that it sees place the keyframe.
-        point_ids: ``(N,)`` the point that each feature of the keyframe shows there, -1 for none.
-    """
-
-    earlier: int
-    T_earlier_keyframe: Floats
-    point_ids: NDArray[np.int64]
 
 
 class LoopCloser:
@@ -85,27 +69,21 @@ class LoopCloser:
         """
         self.places.add_vector(keyframe.id, words)
 
-    def sightings(self, keyframe: MapKeyframe) -> list[Sighting]:
-        """The loops at ``keyframe``, most alike first; the map is left as it is."""
+    def close(self, keyframe: MapKeyframe) -> Correction | None:
+        """Look for a loop at ``keyframe``; on success the map has been corrected."""
         if not self._config.loops.enabled:
-            return []
-        seen = [self.verify(keyframe, candidate) for candidate in self.candidates(keyframe)]
-        return [sighting for sighting in seen if sighting is not None]
-
-    def close(self, keyframe: MapKeyframe, sightings: list[Sighting]) -> Correction | None:
-        """Close the first of the loops that the pose graph believes; on success the map has been corrected.
-
-        Since the loops were sighted keyframes may have been adjusted and points have died; none were merged.
-        """
-        for sighting in sightings:
-            correction = self._correct(keyframe, sighting)
+            return None
+        for candidate in self.candidates(keyframe):
+            verified = self.verify(keyframe, candidate)
+            if verified is None:
+                continue
+            placement, scale = verified
+            correction = self._correct(keyframe, candidate, placement, scale)
             if correction is not None:
-                if self._is_new(keyframe.id, sighting.earlier):
+                if self._is_new(keyframe.id, candidate):
                     self.count += 1
-                self._last = (keyframe.id, sighting.earlier)
-                log.info(
-                    "loop closed: keyframe %d sees the place of keyframe %d", keyframe.id, sighting.earlier
-                )
+                self._last = (keyframe.id, candidate)
+                log.info("loop closed: keyframe %d sees the place of keyframe %d", keyframe.id, candidate)
                 return correction
         return None
 
@@ -127,37 +105,32 @@ class LoopCloser:
         answers = self.places.query_keyframe(keyframe.id, exclude=exclude, top_k=_CANDIDATES)
         return [k for k, score in answers if score >= least]
 
-    def verify(self, keyframe: MapKeyframe, candidate: int) -> Sighting | None:
-        """Where ``candidate`` places ``keyframe``; None where it sees it not."""
+    def verify(self, keyframe: MapKeyframe, candidate: int) -> tuple[Placement, float] | None:
+        """Where ``candidate`` places ``keyframe``, and the ratio of its metres; None where it sees it not."""
         placement = self._localiser.from_keyframe(keyframe.features, candidate, minimum=15)
         if placement is None or placement.inliers < self._config.loops.min_inliers:
             return None
-        T_earlier_world = self._map.keyframes[candidate].T_camera_world
-        return Sighting(candidate, T_earlier_world @ invert(placement.T_camera_world), placement.point_ids)
-
-    def _scale(self, keyframe: MapKeyframe, placement: Placement) -> float:
-        """The metres of the place where a loop puts ``keyframe``, in those of where it is."""
-        if self._is_metric():
-            return 1.0
         both = np.flatnonzero((placement.point_ids >= 0) & (keyframe.point_ids >= 0))
         both = both[placement.point_ids[both] != keyframe.point_ids[both]]
-        there = transform(placement.T_camera_world, self._map.position_w[placement.point_ids[both]])[:, 2]
-        here = transform(keyframe.T_camera_world, self._map.position_w[keyframe.point_ids[both]])[:, 2]
-        ok = (there > NEAREST_M) & (here > NEAREST_M)
-        if np.count_nonzero(ok) < _FEWEST_FOR_SCALE:
-            return 1.0
-        return float(np.exp(np.median(np.log(there[ok] / here[ok]))))
+        scale = 1.0
+        if not self._is_metric() and len(both) >= 10:
+            there = transform(placement.T_camera_world, self._map.position_w[placement.point_ids[both]])[:, 2]
+            here = transform(keyframe.T_camera_world, self._map.position_w[keyframe.point_ids[both]])[:, 2]
+            ok = (there > NEAREST_M) & (here > NEAREST_M)
+            if np.count_nonzero(ok) >= 10:
+                scale = float(np.exp(np.median(np.log(there[ok] / here[ok]))))
+        return placement, scale
 
     def _is_metric(self) -> bool:
         prediction = self._map.keyframes[0].prediction
         return prediction is not None and prediction.is_sensor
 
-    def _correct(self, keyframe: MapKeyframe, sighting: Sighting) -> Correction | None:
-        T_loop = sighting.T_earlier_keyframe
-        earlier = self._map.keyframes[sighting.earlier]
-        placement = Placement(invert(T_loop) @ earlier.T_camera_world, self._map.resolve(sighting.point_ids))
-        scale = self._scale(keyframe, placement)
-        edge = Edge(earlier.id, keyframe.id, T_loop, scale, self._sigmas(), is_loop=True)
+    def _correct(
+        self, keyframe: MapKeyframe, candidate: int, placement: Placement, scale: float
+    ) -> Correction | None:
+        other = self._map.keyframes[candidate]
+        T_loop = other.T_camera_world @ invert(placement.T_camera_world)
+        edge = Edge(candidate, keyframe.id, T_loop, scale, self._sigmas(), is_loop=True)
         new = [edge]
         scales = np.ones(len(self._map.keyframes))
         if self._is_off(keyframe, placement, scale):
@@ -168,7 +141,7 @@ class LoopCloser:
                 result = self._optimised_after_drift(T_old, new)
             if result is None:
                 self._refused.add(edge)
-                log.info("loop %d-%d refused by the pose graph", earlier.id, keyframe.id)
+                log.info("loop %d-%d refused by the pose graph", candidate, keyframe.id)
                 return None
             scales = result.scales
             self._bend(T_old, result.T_world_camera, scales)

@@ -158,7 +158,7 @@ class Tracker:
         self._watch.add("features", prepared.took_ms)
         if not self._map.keyframes:
             return self._start(frame, plain)
-        if not self._keyframes.remembers_rows:
+        if not self._keyframes.is_adjusting:
             self._forget_points()
         with self._watch.timed("tracking"):
             features = self._still(frame, plain)
