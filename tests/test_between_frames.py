@@ -8,6 +8,7 @@ import threading
 import pytest
 from tracking_scene import CAMERA, CONFIG, ConstantDepth, colour_only, frames
 
+from slamdepth.config import Config, merge
 from slamdepth.tracker import Tracker
 from slamdepth.tracker.between_frames import BetweenFrames
 from slamdepth.types import DepthPrediction, Frame
@@ -60,12 +61,14 @@ class HeldBack(ConstantDepth):
 
 def test_points_are_born_between_two_frames_without_another_step() -> None:
     model = HeldBack()
-    tracker = Tracker(CAMERA, model, CONFIG)
+    # a short delay: no frame wants a third keyframe, and so the depth earlier, while two wait
+    config = Config.from_dict(merge(CONFIG.model_dump(), {"tracking": {"depth_delay": 3}}))
+    tracker = Tracker(CAMERA, model, config)
     due = before = after = 0
     for frame in frames(change=colour_only):
         result = tracker.step(frame)
         if result.is_keyframe and result.keyframes == 5:
-            due = frame.index + CONFIG.tracking.depth_delay
+            due = frame.index + config.tracking.depth_delay
         if due and frame.index == due - 1:
             before = tracker._map.size  # the step has returned although the next one needs the depth
             model.may_go.set()
