@@ -17,6 +17,7 @@ import numpy as np
 
 from slamdepth.datasets import Dataset
 from slamdepth.depth.base import DepthModel
+from slamdepth.depth.weights import cache_dir
 from slamdepth.errors import ConfigError, ImageDecodeError
 from slamdepth.io import replacing
 from slamdepth.types import DepthKind
@@ -25,6 +26,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 logger = logging.getLogger(__name__)
+
+
+def default_cache() -> Path:
+    """Where benchmarks keep predictions and vocabularies unless told another folder."""
+    return cache_dir() / "benchmarks"
 
 
 @dataclass(frozen=True)

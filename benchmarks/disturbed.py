@@ -24,6 +24,7 @@ from benchmarks.ours import SlamDepth
 from benchmarks.summary import environment
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
+from slamdepth.depth.base import DepthModel
 from slamdepth.errors import DatasetError, InputError
 from slamdepth.evaluation import score_trajectory
 from slamdepth.io import write_json
@@ -45,15 +46,20 @@ def opened(path: Path) -> Dataset:
     return dataset
 
 
-def run(dataset: Dataset, disturbance: Disturbance, depth: str, count: int) -> dict[str, Any]:
+def run(
+    dataset: Dataset, disturbance: Disturbance, config: Config, count: int, model: DepthModel | None = None
+) -> dict[str, Any]:
     """One run over the first ``count`` frames of a sequence with ground truth.
+
+    Args:
+        model: in place of the depth model that ``config`` names.
 
     Raises:
         DatasetError: too few poses can be scored.
     """
-    system = SlamDepth(disturbance.camera(dataset.camera), Config.from_dict({"depth": {"name": depth}}))
+    system = SlamDepth(disturbance.camera(dataset.camera), config, model)
     steps_s: list[float] = []
-    for frame in disturbance.play(dataset, count, with_depth=depth == "sensor"):
+    for frame in disturbance.play(dataset, count, with_depth=config.depth.name == "sensor"):
         begun = time.perf_counter()
         system.step(frame)
         steps_s.append(time.perf_counter() - begun)
@@ -136,13 +142,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for depth in asked.depth.split(","):
             if depth == "sensor" and not dataset.has_depth:
                 continue
+            config = Config.from_dict({"depth": {"name": depth}})
             for name, disturbance in ways.items():
                 if disturbance.has_depth is not None and depth != "sensor":
                     continue  # as it is, to a network
                 about = {"sequence": dataset.name, "depth": depth, "disturbance": name}
                 with Console(stderr=True).status(f"{dataset.name} [{depth}]: {name}"):
                     try:
-                        figures = run(dataset, disturbance, depth, count)
+                        figures = run(dataset, disturbance, config, count)
                     except DatasetError as error:  # too few poses to score; the other rows go on
                         figures = {"error": str(error)}
                 rows.append({**about, **figures})

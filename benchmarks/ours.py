@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from benchmarks.system import Estimate
 from slamdepth.config import Config
+from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.pipeline.results import keyframe_trajectory
 from slamdepth.pipeline.run import seed_everything, seed_torch
@@ -15,13 +16,16 @@ from slamdepth.types import Camera, Frame
 class SlamDepth:
     """What ``slamdepth run --no-mesh`` does to each frame; the network runs live.
 
+    Args:
+        model: in place of the one that ``config`` names.
+
     Raises:
         WeightsError: the weights of the depth model are not there.
     """
 
-    def __init__(self, camera: Camera, config: Config) -> None:
+    def __init__(self, camera: Camera, config: Config, model: DepthModel | None = None) -> None:
         seed_everything(config.seed)
-        model = create_depth_model(
+        model = model or create_depth_model(
             config.depth.name, device=config.device, seed=config.seed, weights=config.depth.weights
         )
         seed_torch(config.seed)

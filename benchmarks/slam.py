@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.command import errors_in_one_line
+from benchmarks.depth_cache import default_cache
 from benchmarks.jobs import Job, run_job
 from benchmarks.orbslam3 import HOW_TO_INSTALL
 from benchmarks.rows import ABLATIONS, NONE, SENSOR, SYSTEMS, Row, config_of, plan_ablation, plan_rows
@@ -166,8 +167,6 @@ def make_plan(options: argparse.Namespace) -> Plan:
     Raises:
         InputError: a sequence, a system, a depth or a feature does not exist.
     """
-    from platformdirs import user_cache_dir
-
     from slamdepth.depth.registry import depth_model_names
 
     for depth in options.depth:
@@ -196,7 +195,7 @@ def make_plan(options: argparse.Namespace) -> Plan:
         rows,
         options.runs,
         base,
-        (options.cache or Path(user_cache_dir("slamdepth")) / "benchmarks").resolve(),
+        (options.cache or default_cache()).resolve(),
         options.vocabulary and options.vocabulary.resolve(),
         training_images(options.data, sequences.values()),
         options.timeout,
