@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 _SEARCHED_AGAIN = 6  # neighbours of each keyframe; twice as many gain nothing measurable
 _PASSES = 3  # after the first adjustment; more than one only while the readout time changes
 _SETTLED_S = 0.002
+_OTHER_START = (5, 10)  # steps of adjustments from two starts, of which the better one is kept
 _MAX_KEYFRAMES = 600  # beyond, the reduced camera system outgrows a laptop's memory
 
 
@@ -61,10 +62,15 @@ def optimise_everything(
         )
     if mapper.dropped:
         notes.append(f"{mapper.dropped} predicted depth maps disagreed with the map and were not used")
-    prediction = keyframes[0].prediction
-    if prediction is not None and not prediction.is_sensor:
+    if _is_predicted(landmarks):
         votes = _make_metric(landmarks, frames)
     return notes, votes
+
+
+def _is_predicted(landmarks: LandmarkMap) -> bool:
+    """Whether depth is a network's: a sensor's leaves neither the scale nor a bad start to be found."""
+    prediction = landmarks.keyframes[0].prediction
+    return prediction is not None and not prediction.is_sensor
 
 
 def _adjust_all(
@@ -74,6 +80,8 @@ def _adjust_all(
     every = [k.id for k in landmarks.keyframes]
     _follow_motion(frames, shutter)
     adjuster.adjust(every, [], landmarks.seen_by(2), (3, 5))
+    if _is_predicted(landmarks) and adjuster.reconsider(every, landmarks.seen_by(2), _OTHER_START):
+        log.info("keyframes that share few points were placed anew from those that share many")
     for n in range(_PASSES):
         before_s = shutter.readout_s
         if shutter.is_sought:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.backend.bundle import BundleProblem, BundleResult, bundle_adjust
+from slamdepth.backend.bundle import CHI2_2DOF_95, BundleProblem, BundleResult, bundle_adjust
+from slamdepth.backend.resection import placed_anew
 from slamdepth.config import Config
 from slamdepth.geometry import invert, orthonormalised, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 _MIN_OBSERVATIONS = 30
 _READOUT_KEYFRAMES = 20  # among the recent ones, when the readout time is sought on the way
 _READOUT_STEPS = (2, 2)
+_BETTER = 0.98  # of the cost: another start must be so much better to be believed
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,11 @@ class Adjustment:
     part: _Part
     keyframes: int
     result: Future[BundleResult]
+
+
+def _whole_cost(result: BundleResult) -> float:
+    """The cost of what was kept, and for what was not the least it would have been."""
+    return result.final_cost + CHI2_2DOF_95 * float(np.count_nonzero(~result.inlier))
 
 
 class MapAdjuster:
@@ -68,6 +75,24 @@ class MapAdjuster:
         part = self._part(window, fixed, rows)
         if part is not None:
             self._take_over(part, bundle_adjust(part.problem, iterations))
+
+    def reconsider(self, window: list[int], rows: Ints, iterations: tuple[int, ...]) -> bool:
+        """Look for a better minimum: adjust from where the map is, and from another start.
+
+        The map is changed where the other start ends better, by more than chance.
+
+        Returns:
+            Whether the other start was the better one.
+        """
+        part = self._part(window, [], rows)
+        other = None if part is None else placed_anew(part.problem)
+        if part is None or other is None:
+            return False
+        was, now = (bundle_adjust(problem, iterations) for problem in (part.problem, other))
+        if _whole_cost(now) > _BETTER * _whole_cost(was):
+            return False
+        self._take_over(part, now)
+        return True
 
     def begin(
         self, window: list[int], fixed: list[int], rows: Ints, iterations: tuple[int, ...]
