@@ -15,10 +15,13 @@ from tracking_scene import CAMERA, CONFIG, Run, ate_m, frames, played
 
 from slamdepth.config import Config, ShutterConfig
 from slamdepth.depth.sensor import SensorDepth
+from slamdepth.frontend.features import Features
 from slamdepth.frontend.rolling_shutter import at_middle_row, px_per_readout_s, row_phase, velocity_between
 from slamdepth.geometry import backproject, invert, project, se3_exp, so3_exp, transform
-from slamdepth.mapping.landmarks import LandmarkMap
+from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker import create_tracker
+from slamdepth.tracker.frame_log import FrameLog
+from slamdepth.tracker.localiser import Placement
 from slamdepth.tracker.shutter import Shutter
 from slamdepth.types import Camera, Frame, Reconstruction
 
@@ -224,3 +227,31 @@ def test_a_cut_in_the_recording_is_no_motion(rolling_frames: list[Frame], cut: i
         np.testing.assert_allclose(after.T_world_camera, before.T_world_camera, atol=0.04)
     made = run.finish().trajectory.T_world_camera
     np.testing.assert_allclose(made[cut:], made[:16], atol=0.03)
+
+
+def test_a_frame_found_anew_is_as_fast_as_the_frames_after_it() -> None:
+    """It was placed without a velocity, so its own place is not to be trusted for one."""
+    landmarks = LandmarkMap()
+    log = FrameLog(PINHOLE, landmarks)
+    velocity = np.array([0.3, -0.1, 0.2, 0.1, 0.2, -0.3])
+    off = se3_exp(np.array([0.03, 0.02, 0.0, 0.0, 0.02, 0.0]))
+    for n in range(3):
+        T_camera_world = invert(moved(velocity, n / 30))
+        if n == 0:
+            T_camera_world = off @ T_camera_world
+            landmarks.keyframes.append(empty_keyframe(T_camera_world))
+        placement = Placement(T_camera_world, np.zeros(0, np.int64))
+        log.add(n / 30, no_features(), placement, n == 0, is_found_anew=n == 0)
+    log.refresh_velocities()
+    np.testing.assert_allclose(landmarks.keyframes[0].velocity, velocity, atol=0.01)
+
+
+def no_features() -> Features:
+    nothing = np.zeros((0, 2), np.float32)
+    return Features(nothing, nothing, np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 32), np.uint8))
+
+
+def empty_keyframe(T_camera_world: NDArray[np.float64]) -> MapKeyframe:
+    frame = Frame(0, 0.0, np.zeros((480, 640, 3), np.uint8), PINHOLE)
+    nothing = np.zeros(0)
+    return MapKeyframe(0, frame, no_features(), T_camera_world, np.zeros(0, np.int64), nothing, nothing)

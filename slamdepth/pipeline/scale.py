@@ -131,7 +131,7 @@ def _own_sentence(before: PredictionScale, votes: int, spread: float | None, sig
     if before.source is ScaleSource.VALUE:
         sure = "how true it is nobody measured"
     elif not before.sigma_is_known:
-        sure += ", an assumption"
+        sure += " in two of three places, an assumption"
     elif votes:
         sure += ", one standard error"
     if before.source is ScaleSource.NETWORK:

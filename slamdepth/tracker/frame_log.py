@@ -138,15 +138,22 @@ class FrameLog:
         return None
 
     def _velocity(self, n: int) -> Floats:
-        """Central difference over the frames before and after the ``n``-th, where the camera moved on."""
+        """Central difference over the frames before and after the ``n``-th, where the camera moved on.
+
+        A frame found anew was placed before it had a velocity, so the two frames after it tell more.
+        """
+        if self._placed[n].is_found_anew and self._moved_to(n + 1) and self._moved_to(n + 2):
+            return self._between(n + 1, n + 2)
         ends = [n]
         if self._moved_to(n):
             ends.insert(0, n - 1)
         if self._moved_to(n + 1):
             ends.append(n + 1)
-        first, last = self._placed[ends[0]], self._placed[ends[-1]]
-        if first is last:
-            return np.zeros(6)
+        return self._between(ends[0], ends[-1]) if len(ends) > 1 else np.zeros(6)
+
+    def _between(self, m: int, n: int) -> Floats:
+        """Velocity ``(6,)`` that leads from the ``m``-th frame to the ``n``-th."""
+        first, last = self._placed[m], self._placed[n]
         return velocity_between(
             self.T_camera_world(first), self.T_camera_world(last), last.timestamp_s - first.timestamp_s
         )
