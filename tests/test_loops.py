@@ -11,12 +11,14 @@ import pytest
 from tracking_scene import CONFIG as WALK_CONFIG
 from tracking_scene import Run, frames
 
+from slamdepth.backend.pose_graph import Edge
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, invert, project, rotation_angle_rad, se3_exp, so3_exp, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracker.localiser import Localiser, Placement
 from slamdepth.tracker.loop_closer import Correction, LoopCloser
+from slamdepth.tracker.refused_loops import RefusedLoops
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
@@ -57,6 +59,8 @@ class World:
         turn_drift, shift_drift_m, scale_drift: radians, metres and share of the scale lost each step.
         alone: no point is followed from one keyframe to the next, so that each looks for loops.
         seen_from: keyframes that see, beside their own place, another one's furniture as from this pose.
+        astray: keyframes before which odometry turns wrongly by ten degrees each; before the first of them
+            no point is followed.
     """
 
     def __init__(
@@ -69,13 +73,14 @@ class World:
         is_sensor: bool,
         alone: bool = False,
         seen_from: dict[int, np.ndarray] | None = None,
+        astray: range = range(0),
     ) -> None:
         self.map = LandmarkMap()
         self.closer = LoopCloser(CONFIG, self.map, Localiser(CAMERA, CONFIG, self.map))
         self._rows: dict[int, int] = {}  # of the points tracked at present
         self._turn_drift, self._scale_drift, self._is_sensor = turn_drift, scale_drift, is_sensor
         self._shift_drift_m, self._alone, self._seen_from = shift_drift_m, alone, seen_from or {}
-        self._true_of: list[int] = []
+        self._astray = astray
         self.corrections: list[tuple[int, Correction]] = []
         self._pose = np.eye(4)
         for _ in range(count):
@@ -87,10 +92,13 @@ class World:
         if k:
             step = invert(true_pose(k - 1)) @ true_pose(k)
             step[:3, 3] *= scale
-            drift = so3_exp(np.array([0.0, self._turn_drift, 0.0]))
+            wrongly = np.deg2rad(10.0) if k in self._astray else 0.0
+            drift = so3_exp(np.array([0.0, self._turn_drift + wrongly, 0.0]))
             step[:3, :3] = step[:3, :3] @ drift
             step[1, 3] += self._shift_drift_m
             self._pose = self.map.keyframes[-1].T_world_camera @ step
+        if k in self._astray[:1]:
+            self._rows = {}
         descriptors = ring()[1]
         seen, px, z = view(true_pose(k))
         own = np.ones(len(seen), dtype=bool)
@@ -212,6 +220,33 @@ def test_a_large_drift_is_closed_once_three_keyframes_agree(is_sensor: bool) -> 
     scales = np.array([k.scale for k in world.map.keyframes])
     np.testing.assert_allclose(scales, 1.0, atol=1e-12 if is_sensor else 0.06)
     recount_is_right(world.map)
+
+
+@pytest.mark.parametrize("is_sensor", [True, False])
+def test_odometry_that_went_astray_is_not_believed_against_three_loops(is_sensor: bool) -> None:
+    """Each keyframe turns by ten degrees too many, so that no two loops agree on what happened before."""
+    first = TURN - 1
+    world = World(TURN + 1, is_sensor=is_sensor, astray=range(first, TURN + 9))
+    assert world.closer.count == 0  # two keyframes see the place of another, and are not believed
+    assert world.turn_errors_rad()[-1] > np.deg2rad(19.0)
+    assert world.grow() is not None
+    assert world.closer.count == 1
+    assert world.turn_errors_rad().max() < np.deg2rad(1.5)
+    assert world.position_errors_m().max() < 0.03
+    recount_is_right(world.map)
+
+
+def test_loops_between_which_no_camera_could_move_do_not_insist() -> None:
+    refused, still = RefusedLoops(), np.tile(np.eye(4), (40, 1, 1))
+    for n, shift_m in enumerate((0.0, 5.0, 0.0)):
+        T = np.eye(4)
+        T[0, 3] = 2.0 + shift_m
+        refused.add(Edge(n, 30 + n, T, is_loop=True))
+    assert refused.insisted(still, with_scale=False) == []
+    refused.forget()
+    for n, turn_rad in enumerate((0.0, 0.3, 0.0)):
+        refused.add(Edge(n, 30 + n, se3_exp(np.array([2.0, 0, 0, 0, turn_rad, 0])), is_loop=True))
+        assert len(refused.insisted(still, with_scale=False)) == (3 if n == 2 else 0)
 
 
 def offered(world: World) -> list[tuple[bool, bool]]:

@@ -141,6 +141,9 @@ class LoopCloser:
                 result = self._optimised_after_drift(T_old, new)
             if result is None:
                 self._refused.add(edge)
+                new = self._refused.insisted(T_old, with_scale=not self._is_metric())
+                result = self._optimised_after_break(T_old, new)
+            if result is None:
                 log.info("loop %d-%d refused by the pose graph", candidate, keyframe.id)
                 return None
             scales = result.scales
@@ -169,6 +172,24 @@ class LoopCloser:
                 return result
         return None
 
+    def _optimised_after_break(self, T_old: Floats, insisted: list[Edge]) -> PoseGraphResult | None:
+        """The same where one keyframe after the other sees another place than odometry has led to.
+
+        Odometry is believed up to where two keyframes share fewest points, and hardly from there on.
+        """
+        if not insisted:
+            return None
+        together = self._map.covisibility()
+        before, after = max(edge.i for edge in insisted), min(edge.j for edge in insisted)
+        if before >= after:
+            return None
+        links = together[np.arange(before, after), np.arange(before + 1, after + 1)]
+        last_good = before + int(np.argmin(links))
+        edges = [*self._odometry_edges(_LOOSER[-1], after=last_good), *self._edges]
+        edges += [replace(edge, is_loop=False) for edge in insisted]
+        log.info("%d loops insist: odometry is not believed after keyframe %d", len(insisted), last_good)
+        return optimise_pose_graph(T_old, edges, with_scale=not self._is_metric())
+
     def _is_off(self, keyframe: MapKeyframe, placement: Placement, scale: float) -> bool:
         D = placement.T_camera_world @ keyframe.T_world_camera
         far = float(np.linalg.norm(D[:3, 3])) > 0.02
@@ -177,13 +198,13 @@ class LoopCloser:
     def _sigmas(self) -> tuple[float, float, float]:
         return (0.01, 0.02, 0.03)
 
-    def _odometry_edges(self, looser: float = 1.0) -> list[Edge]:
+    def _odometry_edges(self, looser: float = 1.0, *, after: int = -1) -> list[Edge]:
         """Neighbours in time, and those that share most points: what holds the graph's shape.
 
         A keyframe's edges all come from the same observations, so each counts for its share only.
 
         Args:
-            looser: factor on all deviations.
+            looser: factor on the deviations of what leads to keyframes after ``after``, by default to all.
         """
         keyframes = self._map.keyframes
         together = self._map.covisibility()
@@ -194,7 +215,8 @@ class LoopCloser:
             partners = {j - 1, *best[shared[best] >= _COVISIBLE].tolist()}
             for i in sorted(partners):
                 T_i_j = keyframes[i].T_camera_world @ keyframe.T_world_camera
-                rotation, translation, log_scale = (s * looser * np.sqrt(len(partners)) for s in STEP_SIGMAS)
+                factor = np.sqrt(len(partners)) * (looser if j > after else 1.0)
+                rotation, translation, log_scale = (s * factor for s in STEP_SIGMAS)
                 edges.append(Edge(i, j, T_i_j, 1.0, (rotation, translation, log_scale)))
         return edges
 
