@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from tracking_scene import ConstantDepth, Run, colour_only, frames
 
 from slamdepth.backend.bundle import BundleProblem, bundle_adjust
 from slamdepth.backend.resection import placed_anew
@@ -226,3 +227,21 @@ def test_another_start_that_ends_no_better_is_not_taken(monkeypatch: pytest.Monk
     is_better, T = reconsidered(exact)
     assert not is_better
     np.testing.assert_array_equal(T, exact.T_camera_world)
+
+
+def test_another_start_is_told_and_only_asked_for_with_predicted_depth(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[int] = []
+
+    def reconsider(self: MapAdjuster, window: list[int], *rest: object) -> bool:
+        asked.append(len(window))
+        return True
+
+    monkeypatch.setattr(MapAdjuster, "reconsider", reconsider)
+    given = frames(range(24), change=colour_only)
+    notes = Run(given, ConstantDepth()).finish().notes
+    assert len(asked) == 1
+    assert any("placed anew" in note for note in notes)
+    assert not any("placed anew" in note for note in Run(frames(range(24))).finish().notes)
+    assert len(asked) == 1

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -27,8 +26,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
-
-log = logging.getLogger(__name__)
 
 _SEARCHED_AGAIN = 6  # neighbours of each keyframe; twice as many gain nothing measurable
 _PASSES = 3  # after the first adjustment; more than one only while the readout time changes
@@ -54,7 +51,11 @@ def optimise_everything(
     votes: tuple[float, ...] = ()
     keyframes = landmarks.keyframes
     if config.bundle.final and 3 <= len(keyframes) <= _MAX_KEYFRAMES:
-        _adjust_all(landmarks, mapper, adjuster, frames, shutter)
+        if _adjust_all(landmarks, mapper, adjuster, frames, shutter):
+            notes.append(
+                "keyframes that share few points were placed anew from those that share many: what the "
+                "tracker said of them while it ran was wrong"
+            )
     elif len(keyframes) > _MAX_KEYFRAMES:
         notes.append(
             f"the final adjustment of the whole map was left out: {len(keyframes)} keyframes, "
@@ -75,13 +76,16 @@ def _is_predicted(landmarks: LandmarkMap) -> bool:
 
 def _adjust_all(
     landmarks: LandmarkMap, mapper: LocalMapper, adjuster: MapAdjuster, frames: FrameLog, shutter: Shutter
-) -> None:
-    """Adjust everything, look again for what the better map predicts to be seen, and adjust once more."""
+) -> bool:
+    """Adjust everything, look again for what the better map predicts to be seen, and adjust once more.
+
+    Returns:
+        Whether it all started anew, see :mod:`slamdepth.backend.resection`.
+    """
     every = [k.id for k in landmarks.keyframes]
     _follow_motion(frames, shutter)
     adjuster.adjust(every, [], landmarks.seen_by(2), (3, 5))
-    if _is_predicted(landmarks) and adjuster.reconsider(every, landmarks.seen_by(2), _OTHER_START):
-        log.info("keyframes that share few points were placed anew from those that share many")
+    is_anew = _is_predicted(landmarks) and adjuster.reconsider(every, landmarks.seen_by(2), _OTHER_START)
     for n in range(_PASSES):
         before_s = shutter.readout_s
         if shutter.is_sought:
@@ -95,6 +99,7 @@ def _adjust_all(
         adjuster.adjust(every, [], landmarks.seen_by(2), (3, 3))
         if is_settled:
             break
+    return is_anew
 
 
 def _follow_motion(frames: FrameLog, shutter: Shutter) -> None:
