@@ -73,6 +73,7 @@ class BundleConfig(_Section):
 
     window: int = Field(8, ge=2, description="keyframes adjusted together after each new one")
     fixed: int = Field(6, ge=1, description="further keyframes that hold the window in place")
+    local: bool = Field(True, description="adjust a window after each new keyframe")
     final: bool = Field(True, description="adjust the whole map once at the end")
     prior_inflation: float = Field(
         6.0,
@@ -99,6 +100,9 @@ class DepthConfig(_Section):
     )
     min_m: float = Field(0.1, gt=0, description="nearer depth is dropped")
     max_m: float = Field(10.0, gt=0, description="farther depth is dropped")
+    uncertainty: bool = Field(
+        True, description="weigh predictions by what the model says of their errors, not all alike"
+    )
     max_sigma_log: float = Field(
         1.0, gt=0, description="pixels whose log depth is less sure than this never become map points"
     )

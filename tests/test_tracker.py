@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import CameraError, ConfigError, TrackingError
 from slamdepth.geometry import invert, rotation_angle_rad, transform
 from slamdepth.tracker import CloudTracker, Tracker, create_tracker
+from slamdepth.tracker.map_adjuster import MapAdjuster
 from slamdepth.types import DepthKind, DepthPrediction, Frame, Reconstruction, TrackingStatus
 
 
@@ -232,3 +234,30 @@ def test_the_network_runs_on_keyframes_only() -> None:
     model = ConstantDepth()
     run = Run(frames(range(20), colour_only), model)
     assert model.calls == run.results[-1].keyframes
+
+
+def test_what_a_network_says_of_its_errors_can_be_kept_back() -> None:
+    def trajectory(sigma_log: float, *, is_heard: bool) -> np.ndarray:
+        config = Config.from_dict({**CONFIG.model_dump(), "depth": {"uncertainty": is_heard}})
+        run = Run(frames(range(30), change=colour_only), ConstantDepth(sigma_log=sigma_log), config)
+        return run.finish().trajectory.T_world_camera
+
+    np.testing.assert_array_equal(trajectory(0.1, is_heard=False), trajectory(0.45, is_heard=False))
+    assert not np.array_equal(trajectory(0.1, is_heard=True), trajectory(0.45, is_heard=True))
+
+
+def test_windows_can_be_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[int] = []
+    begin = MapAdjuster.begin
+
+    def counted(self: MapAdjuster, window: list[int], *rest: Any) -> Any:
+        begun.append(len(window))
+        return begin(self, window, *rest)
+
+    monkeypatch.setattr(MapAdjuster, "begin", counted)
+    for is_local in (True, False):
+        begun.clear()
+        config = Config.from_dict({**CONFIG.model_dump(), "bundle": {"local": is_local, "final": False}})
+        run = Run(frames(range(30)), config=config)
+        assert run.finish().trajectory.timestamps_s.shape == (30,)
+        assert bool(begun) is is_local

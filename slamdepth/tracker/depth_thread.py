@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 from slamdepth.depth.base import DepthModel
 from slamdepth.tracker.threads import one_thread_here
@@ -15,10 +16,14 @@ class DepthThread:
 
     The thread computes on one core: the tracker needs the other, and sums do not depend on
     how many there are. A sensor's depth is there already and is passed on at once.
+
+    Args:
+        with_uncertainty: False keeps back what a network says of its errors.
     """
 
-    def __init__(self, model: DepthModel) -> None:
+    def __init__(self, model: DepthModel, *, with_uncertainty: bool = True) -> None:
         self._model = model
+        self._with_uncertainty = with_uncertainty
         self._pool = ThreadPoolExecutor(1, "slamdepth-depth", initializer=one_thread_here)
         self._asked: list[tuple[Frame, Future[DepthPrediction]]] = []
         self._taken: tuple[Frame, DepthPrediction] | None = None
@@ -37,7 +42,13 @@ class DepthThread:
     def ask(self, frame: Frame) -> None:
         """Start the prediction for ``frame``, after those asked for before; nothing where it was."""
         if not self._is_taken(frame) and all(asked is not frame for asked, _ in self._asked):
-            self._asked.append((frame, self._pool.submit(self._model.predict, frame)))
+            self._asked.append((frame, self._pool.submit(self._predict, frame)))
+
+    def _predict(self, frame: Frame) -> DepthPrediction:
+        prediction = self._model.predict(frame)
+        if self._with_uncertainty or prediction.is_sensor:
+            return prediction
+        return replace(prediction, sigma_log=None)
 
     def take(self, frame: Frame) -> DepthPrediction:
         """The prediction for ``frame``; waits for it. The last one taken can be taken again."""

@@ -201,7 +201,9 @@ class LocalMapper:
 
     def begin_window(self, keyframe: MapKeyframe) -> Adjustment | None:
         """Local bundle adjustment of the keyframe and those that see most of its points, in the thread
-        beside; see :meth:`MapAdjuster.begin`."""
+        beside; see :meth:`MapAdjuster.begin`. None where it is switched off."""
+        if not self._config.bundle.local:
+            return None
         return self._adjuster.begin(*self._window(keyframe), _LOCAL_STEPS)
 
     def _window(self, keyframe: MapKeyframe) -> tuple[list[int], list[int], Ints]:

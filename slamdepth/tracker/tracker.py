@@ -78,7 +78,9 @@ class Tracker:
     ) -> None:
         self.camera = camera
         self.config = config or Config()
-        self._depth = DepthThread(model_for(depth_model, self.config))
+        self._depth = DepthThread(
+            model_for(depth_model, self.config), with_uncertainty=self.config.depth.uncertainty
+        )
         self._preparation = Preparation(camera, self.config.features)
         self._watch = Stopwatch()
         self._map = LandmarkMap()
