@@ -2,6 +2,7 @@
 """Many runs from few recordings: sequences begun later and with fewer frames, and what they have in common.
 
 python -m benchmarks.cuttings SEQ... --starts 0,50,100 --strides 2,3 --set bundle.prior_inflation=9
+python -m benchmarks.cuttings SEQ... --disturbance "half hidden by a bar"
 
 One run of one sequence moves by a third when anything changes, so it decides nothing. Each cutting has
 other keyframes; the means over all are what a setting is judged by. Predictions are made once a frame and
@@ -14,7 +15,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -25,8 +26,8 @@ from rich.console import Console
 
 from benchmarks.command import errors_in_one_line
 from benchmarks.depth_cache import DepthCache, default_cache
-from benchmarks.disturbances import Disturbance
-from benchmarks.disturbed import opened, run
+from benchmarks.disturbances import DISTURBANCES, Disturbance
+from benchmarks.disturbed import chosen, opened, run
 from benchmarks.markdown import markdown_table
 from benchmarks.remembered_depth import RememberedDepth
 from benchmarks.summary import environment
@@ -47,6 +48,7 @@ class Cutting:
 
     Attributes:
         settings: nested, as of a settings file.
+        disturbance: what is done to the frames, by its name in ``DISTURBANCES``.
     """
 
     sequence: Path
@@ -55,20 +57,29 @@ class Cutting:
     depth: str
     settings: dict[str, Any]
     cache: Path
+    disturbance: str
 
     def config(self) -> Config:
         """Errors as of ``Config.from_dict``."""
         return Config.from_dict(merge({"depth": {"name": self.depth}}, self.settings), origin="--set")
+
+    def _played(self) -> Disturbance:
+        whole = DISTURBANCES[self.disturbance]
+
+        def is_dropped(n: int) -> bool:
+            return n < self.start or (n - self.start) % self.stride > 0 or whole.is_dropped(n)
+
+        return replace(whole, is_dropped=is_dropped)
 
     def figures(self) -> dict[str, Any]:
         """Its row of the file: a run's figures, or why there are none."""
         dataset = opened(self.sequence)
         model = create_depth_model(self.depth)
         if self.depth != "sensor":
-            model = RememberedDepth(model, DepthCache.of(self.cache / "with_sigma", dataset, model).folder)
-        played = Disturbance(is_dropped=lambda n: n < self.start or (n - self.start) % self.stride > 0)
+            cache = self.cache / "with_sigma" / self.disturbance.replace(" ", "_")
+            model = RememberedDepth(model, DepthCache.of(cache, dataset, model).folder)
         try:
-            figures = run(dataset, played, self.config(), len(dataset), model)
+            figures = run(dataset, self._played(), self.config(), len(dataset), model)
         except DatasetError as error:  # too few poses to score; the other rows go on
             figures = {"error": str(error)}
         return {"sequence": dataset.name, "start": self.start, "stride": self.stride, **figures}
@@ -87,7 +98,7 @@ def cuttings(asked: argparse.Namespace) -> list[Cutting]:
             continue
         wanted = [*((start, 1) for start in asked.starts), *((asked.starts[0], n) for n in asked.strides)]
         found += [
-            Cutting(path, start, stride, asked.depth, asked.settings, asked.cache)
+            Cutting(path, start, stride, asked.depth, asked.settings, asked.cache, asked.disturbance)
             for start, stride in dict.fromkeys(wanted)
             if (len(dataset) - start) // stride >= _SHORTEST
         ]
@@ -162,6 +173,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--depth", default="dinov2", help="'sensor' or a depth model (default: dinov2)")
     parser.add_argument("--set", type=_setting, action="append", default=[], dest="settings",
                         metavar="SECTION.KEY=VALUE", help="a setting; can be repeated")  # fmt: skip
+    parser.add_argument("--disturbance", default="as it is", metavar="NAME",
+                        help="of benchmarks.disturbed, done to every cutting")  # fmt: skip
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs at once (default: 1)")
     parser.add_argument("--cache", type=Path, metavar="DIR", help="folder for predictions")
     parser.add_argument("--output", "-o", type=Path, metavar="FILE", help="write the figures as JSON")
@@ -184,6 +197,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     asked, begun = parse(arguments), environment()
+    chosen(asked.disturbance)
     wanted = cuttings(asked)
     if not wanted:
         raise ConfigError(f"no cutting has {_SHORTEST} frames and the depth that was asked for")
@@ -198,6 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             status.update(f"{len(rows)} of {len(wanted)} runs: {row['sequence']} from {row['start']} done")
             if asked.output:
                 write_json(asked.output, {"format": FORMAT, "environment": begun, "depth": asked.depth,
+                                          "disturbance": asked.disturbance,
                                           "settings": asked.settings, "rows": rows,
                                           "means": means(rows)})  # fmt: skip
     print(table(rows))

@@ -55,11 +55,22 @@ def test_a_short_run_with_a_setting(
     assert str(tmp_path) not in found.read_text(encoding="utf-8")
 
 
+def test_a_cutting_may_be_disturbed(tiny_room: Path, tmp_path: Path) -> None:
+    found = tmp_path / "cuttings.json"
+    wanted = ["--depth", "sensor", "--starts", "3", "--strides", "", "--disturbance", "mirrored"]
+    assert main([str(tiny_room), *wanted, "--output", str(found)]) == 0
+    told = json.loads(found.read_text(encoding="utf-8"))
+    assert told["disturbance"] == "mirrored"
+    assert told["rows"][0]["frames"] == 37
+    assert told["means"]["ate_se3_m"] < 0.02  # by the mirrored truth, that is
+
+
 @pytest.mark.parametrize(
     ("wanted", "told"),
     [
         (["--set", "bundle.windw=6"], "--set: unknown setting 'bundle.windw'"),
         (["--starts", "9999", "--depth", "sensor"], "no cutting has 20 frames"),
+        (["--disturbance", "rain"], "no disturbance 'rain'; there are: as it is, mirrored"),
     ],
 )
 def test_bad_input_is_one_line(
