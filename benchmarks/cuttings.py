@@ -77,7 +77,7 @@ class Cutting:
         model = create_depth_model(self.depth)
         if self.depth != "sensor":
             cache = self.cache / "with_sigma" / self.disturbance.replace(" ", "_")
-            model = RememberedDepth(model, DepthCache.of(cache, dataset, model).folder)
+            model = RememberedDepth(model, DepthCache.of(cache, dataset, model))
         try:
             figures = run(dataset, self._played(), self.config(), len(dataset), model)
         except DatasetError as error:  # too few poses to score; the other rows go on
@@ -128,7 +128,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def _cells(row: dict[str, Any]) -> list[str]:
     names = [row["sequence"], str(row["start"]), str(row["stride"])]
     if "error" in row:
-        return [*names, row["error"], *[""] * (len(_HEADINGS) - 4)]
+        return [*names, row["error"]]
     return [
         *names, f"{100 * row['tracked']:.1f}", f"{row['ate_se3_m']:.4f}", f"{row['ate_sim3_m']:.4f}",
         f"{row['scale']:.3f}", str(row["keyframes"]), str(row["loops"]),

@@ -64,24 +64,31 @@ class DepthCache:
             raise ConfigError(
                 f"depth model '{model.name}' is not metric: peers cannot take it for a sensor's"
             )
-        self.folder.mkdir(parents=True, exist_ok=True)
         made = 0
         for index in indices:
-            if self._path(index).is_file():
+            if self.has(index):
                 continue
             try:
                 frame = dataset.read(index)
             except ImageDecodeError as error:
                 logger.warning("no depth predicted: %s", error)
                 continue
-            values = model.predict(frame).values.astype(np.float16)
-            with replacing(self._path(index)) as temporary, open(temporary, "wb") as file:
-                np.save(file, values)
+            self.write(index, model.predict(frame).values)
             made += 1
         return made
 
+    def has(self, index: int) -> bool:
+        """Whether the frame was predicted."""
+        return self._path(index).is_file()
+
+    def write(self, index: int, maps: NDArray[np.float32]) -> None:
+        """Keep what was predicted for a frame; errors as of :meth:`fill`."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with replacing(self._path(index)) as temporary, open(temporary, "wb") as file:
+            np.save(file, maps.astype(np.float16))
+
     def read(self, index: int) -> NDArray[np.float32]:
-        """Metres ``(H, W)``, 0 where unknown.
+        """What was kept: metres ``(H, W)``, 0 where unknown, unless more was written.
 
         Raises:
             FileNotFoundError: the frame was not predicted.

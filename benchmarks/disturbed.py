@@ -91,7 +91,7 @@ def _names(row: dict[str, Any]) -> list[str]:
 
 def _cells(row: dict[str, Any]) -> list[str]:
     if "error" in row:
-        return [row["error"], *[""] * (len(_HEADINGS) - 4)]
+        return [row["error"]]
     return [
         f"{100 * row['tracked']:.1f}", f"{row['ate_se3_m']:.3f}", f"{row['ate_sim3_m']:.3f}",
         f"{row['scale']:.3f}", *(str(row[name]) for name in ("keyframes", "loops", "relocalisations")),

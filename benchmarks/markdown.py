@@ -7,9 +7,12 @@ from collections.abc import Iterable, Sequence
 
 
 def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Headings and rows of as many cells, which may hold any text of one line."""
+    """Headings and rows of as many cells, of any text on one line; what a row lacks stays empty."""
     lines = [_line(headings), "| --- " * len(headings) + "|"]
-    return "\n".join([*lines, *(_line([cell.replace("|", "\\|") for cell in row]) for row in rows)])
+    for row in rows:
+        cells = [cell.replace("|", "\\|") for cell in row]
+        lines.append(_line([*cells, *[""] * (len(headings) - len(cells))]))
+    return "\n".join(lines)
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.cuttings import cuttings, in_words, main, means, parse
+from benchmarks.depth_cache import DepthCache
 from benchmarks.remembered_depth import RememberedDepth
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
 
@@ -107,8 +108,8 @@ def test_a_frame_is_predicted_once_and_says_the_same_each_time(tmp_path: Path, w
     camera = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
     frames = [Frame(n, n / 10, np.zeros((6, 8, 3), np.uint8), camera) for n in range(3)]
     model = Counting(with_sigma=with_sigma)
-    first = [RememberedDepth(model, tmp_path / "depth").predict(frame) for frame in frames]
-    again = [RememberedDepth(model, tmp_path / "depth").predict(frame) for frame in frames]
+    first = [RememberedDepth(model, DepthCache(tmp_path / "depth")).predict(frame) for frame in frames]
+    again = [RememberedDepth(model, DepthCache(tmp_path / "depth")).predict(frame) for frame in frames]
     assert model.calls == 3
     for frame, one, other in zip(frames, first, again, strict=True):
         np.testing.assert_array_equal(one.values, other.values)

@@ -110,6 +110,12 @@ class LandmarkMap:
     alive: Bools
     alias: Ints
 
+    @property
+    def is_measured(self) -> bool:
+        """Whether depth is a sensor's, so that the map is metric and its scale cannot drift."""
+        prediction = self.keyframes[0].prediction
+        return prediction is not None and prediction.is_sensor
+
     def add_points(
         self, keyframe: MapKeyframe, feature: Ints, position_w: Floats, covariance_w: Floats
     ) -> Ints:

@@ -63,15 +63,9 @@ def optimise_everything(
         )
     if mapper.dropped:
         notes.append(f"{mapper.dropped} predicted depth maps disagreed with the map and were not used")
-    if _is_predicted(landmarks):
+    if not landmarks.is_measured:
         votes = _make_metric(landmarks, frames)
     return notes, votes
-
-
-def _is_predicted(landmarks: LandmarkMap) -> bool:
-    """Whether depth is a network's: a sensor's leaves neither the scale nor a bad start to be found."""
-    prediction = landmarks.keyframes[0].prediction
-    return prediction is not None and not prediction.is_sensor
 
 
 def _adjust_all(
@@ -85,7 +79,8 @@ def _adjust_all(
     every = [k.id for k in landmarks.keyframes]
     _follow_motion(frames, shutter)
     adjuster.adjust(every, [], landmarks.seen_by(2), (3, 5))
-    is_anew = _is_predicted(landmarks) and adjuster.reconsider(every, landmarks.seen_by(2), _OTHER_START)
+    # a sensor's depth leaves no bad start to be found
+    is_anew = not landmarks.is_measured and adjuster.reconsider(every, landmarks.seen_by(2), _OTHER_START)
     for n in range(_PASSES):
         before_s = shutter.readout_s
         if shutter.is_sought:

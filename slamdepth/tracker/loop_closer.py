@@ -113,17 +113,13 @@ class LoopCloser:
         both = np.flatnonzero((placement.point_ids >= 0) & (keyframe.point_ids >= 0))
         both = both[placement.point_ids[both] != keyframe.point_ids[both]]
         scale = 1.0
-        if not self._is_metric() and len(both) >= 10:
+        if not self._map.is_measured and len(both) >= 10:
             there = transform(placement.T_camera_world, self._map.position_w[placement.point_ids[both]])[:, 2]
             here = transform(keyframe.T_camera_world, self._map.position_w[keyframe.point_ids[both]])[:, 2]
             ok = (there > NEAREST_M) & (here > NEAREST_M)
             if np.count_nonzero(ok) >= 10:
                 scale = float(np.exp(np.median(np.log(there[ok] / here[ok]))))
         return placement, scale
-
-    def _is_metric(self) -> bool:
-        prediction = self._map.keyframes[0].prediction
-        return prediction is not None and prediction.is_sensor
 
     def _correct(
         self, keyframe: MapKeyframe, candidate: int, placement: Placement, scale: float
@@ -137,11 +133,11 @@ class LoopCloser:
             T_old = np.stack([k.T_world_camera for k in self._map.keyframes])
             result = self._optimised(T_old, new)
             if result is None:
-                new = self._refused.confirmed(edge, T_old, with_scale=not self._is_metric())
+                new = self._refused.confirmed(edge, T_old, with_scale=not self._map.is_measured)
                 result = self._optimised_after_drift(T_old, new)
             if result is None:
                 self._refused.add(edge)
-                new = self._refused.insisted(T_old, with_scale=not self._is_metric())
+                new = self._refused.insisted(T_old, with_scale=not self._map.is_measured)
                 result = self._optimised_after_break(T_old, new)
             if result is None:
                 log.info("loop %d-%d refused by the pose graph", candidate, keyframe.id)
@@ -158,7 +154,7 @@ class LoopCloser:
     def _optimised(self, T_old: Floats, new: list[Edge], looser: float = 1.0) -> PoseGraphResult | None:
         """The pose graph with the loops ``new``; None where it takes one of them for false."""
         edges = [*self._odometry_edges(looser), *self._edges, *new]
-        result = optimise_pose_graph(T_old, edges, with_scale=not self._is_metric())
+        result = optimise_pose_graph(T_old, edges, with_scale=not self._map.is_measured)
         return result if result.is_inlier[-len(new) :].all() else None
 
     def _optimised_after_drift(self, T_old: Floats, confirmed: list[Edge]) -> PoseGraphResult | None:
@@ -188,7 +184,7 @@ class LoopCloser:
         edges = [*self._odometry_edges(_LOOSER[-1], after=last_good), *self._edges]
         edges += [replace(edge, is_loop=False) for edge in insisted]
         log.info("%d loops insist: odometry is not believed after keyframe %d", len(insisted), last_good)
-        return optimise_pose_graph(T_old, edges, with_scale=not self._is_metric())
+        return optimise_pose_graph(T_old, edges, with_scale=not self._map.is_measured)
 
     def _is_off(self, keyframe: MapKeyframe, placement: Placement, scale: float) -> bool:
         D = placement.T_camera_world @ keyframe.T_world_camera

@@ -85,8 +85,10 @@ class MapAdjuster:
             Whether the other start was the better one.
         """
         part = self._part(window, [], rows)
-        other = None if part is None else placed_anew(part.problem)
-        if part is None or other is None:
+        if part is None:
+            return False
+        other = placed_anew(part.problem)
+        if other is None:
             return False
         was, now = (bundle_adjust(problem, iterations) for problem in (part.problem, other))
         if _whole_cost(now) > _BETTER * _whole_cost(was):
@@ -167,8 +169,7 @@ class MapAdjuster:
             return None
         if not is_fixed.any():
             is_fixed[0] = True  # nothing outside holds the window: its oldest keyframe does
-        first = landmarks.keyframes[0].prediction
-        is_sensor = first is not None and first.is_sensor
+        is_sensor = landmarks.is_measured
         config = self._config.bundle
         sigma_log = np.concatenate([k.sigma_log[at] for k, at in seen])
         problem = BundleProblem(
