@@ -38,7 +38,7 @@ def varied_scene(seed: int) -> synth_scene.Scene:
             continue
         group = list(getattr(furniture, name)(rng))
         if rng.random() < 0.6:
-            group = [replace(s, paint=_any_paint(rng)) if _may_change(s, rng) else s for s in group]
+            group = [replace(s, paint=any_paint(rng)) if _may_change(s, rng) else s for s in group]
         points = np.concatenate([s.points.reshape(-1, 3) for s in group])
         middle = (points.min(axis=0) + points.max(axis=0)) / 2 * [1, 1, 0]
         A = so3_exp(UP * rng.uniform(-np.pi, np.pi)) * rng.uniform(0.9, 1.1)
@@ -52,7 +52,7 @@ def varied_scene(seed: int) -> synth_scene.Scene:
         surfaces += [moved(s, A, place) for s in workplace(rng)]
     for _ in range(rng.integers(0, 10)):
         place = np.append(rng.uniform(0.08, 0.92, 2) * room[:2], 0.0)
-        surfaces += [moved(s, np.eye(3), place) for s in _block(rng, 0.3)]
+        surfaces += [moved(s, np.eye(3), place) for s in block(rng, 0.3)]
     return synth_scene.Scene(surfaces, _lamps(rng, seed, stretch))
 
 
@@ -64,7 +64,7 @@ def plain_scene(seed: int) -> synth_scene.Scene:
     rng = np.random.default_rng([seed, 17])
     scene = varied_scene(seed)
     share = rng.uniform(0.3, 1.0)
-    wall = paint.plain(_grey(rng, 0.6, 0.95), contrast=rng.uniform(0.0, 0.03))
+    wall = paint.plain(grey(rng, 0.6, 0.95), contrast=rng.uniform(0.0, 0.03))
 
     floor = rng.random() < 0.4
 
@@ -78,7 +78,7 @@ def plain_scene(seed: int) -> synth_scene.Scene:
             return replace(surface, paint=wall)
         if kind < 0.6:
             return replace(surface, paint=paint.muted(surface.paint, rng.uniform(0.0, 0.3)))
-        return replace(surface, paint=paint.plain(_grey(rng), contrast=rng.uniform(0.0, 0.03)))
+        return replace(surface, paint=paint.plain(grey(rng), contrast=rng.uniform(0.0, 0.03)))
 
     return replace(scene, surfaces=[repainted(s) for s in scene.surfaces])
 
@@ -91,16 +91,16 @@ def moved(surface: Surface, A: np.ndarray, t: np.ndarray) -> Surface:
 def workplace(rng: np.random.Generator) -> list[Surface]:
     """A table about the origin with the things of an office or kitchen on it, and chairs."""
     width, depth, height = rng.uniform(0.9, 2.0), rng.uniform(0.6, 1.0), rng.uniform(0.70, 0.78)
-    top = [paint.wood(_timber(rng)), paint.plain(_grey(rng, 0.6, 0.95)), paint.plain(_grey(rng))]
+    top = [paint.wood(timber(rng)), paint.plain(grey(rng, 0.6, 0.95)), paint.plain(grey(rng))]
     out = box(
         (-width / 2, -depth / 2, height - 0.03), (width, depth, 0.03), top[rng.integers(3)], bottom=True
     )
-    leg = paint.plain(_grey(rng))
+    leg = paint.plain(grey(rng))
     for x in (-width / 2 + 0.03, width / 2 - 0.08):
         for y in (-depth / 2 + 0.03, depth / 2 - 0.08):
             out += box((x, y, 0.0), (0.05, 0.05, height - 0.03), leg)
     for _ in range(rng.integers(3, 16)):
-        thing = _THINGS[rng.integers(len(_THINGS))](rng)
+        thing = THINGS[rng.integers(len(THINGS))](rng)
         place = np.array([rng.uniform(-0.45, 0.45) * width, rng.uniform(-0.42, 0.42) * depth, height])
         A = so3_exp(UP * rng.normal(0.0, 0.6)) * rng.uniform(0.92, 1.08)
         out += [moved(s, A, place) for s in thing]
@@ -114,15 +114,15 @@ def workplace(rng: np.random.Generator) -> list[Surface]:
 def _shell(rng: np.random.Generator) -> list[Surface]:
     """Walls, floor, ceiling, window, door and pictures; most of them painted as offices are."""
     out = [*synth_scene._shell(rng)]
-    floors = [paint.wood(_timber(rng), plank_m=rng.uniform(0.06, 0.2)),
-              paint.fabric(_colour(rng, 0.1, 0.6)), paint.plain(_grey(rng), contrast=0.06),
-              paint.checker(_grey(rng), _grey(rng), float(rng.uniform(0.2, 0.5)))]  # fmt: skip
+    floors = [paint.wood(timber(rng), plank_m=rng.uniform(0.06, 0.2)),
+              paint.fabric(colour(rng, 0.1, 0.6)), paint.plain(grey(rng), contrast=0.06),
+              paint.checker(grey(rng), grey(rng), float(rng.uniform(0.2, 0.5)))]  # fmt: skip
     if rng.random() < 0.75:
         out[0] = replace(out[0], paint=floors[rng.integers(len(floors))])
     for k in range(2, 6):
         if rng.random() < 0.75:
-            plain = paint.plain(_grey(rng, 0.55, 0.95), contrast=0.02)
-            wall = [plain, plain, paint.plaster(_colour(rng, 0.5, 0.95)), paint.wood(_timber(rng))]
+            plain = paint.plain(grey(rng, 0.55, 0.95), contrast=0.02)
+            wall = [plain, plain, paint.plaster(colour(rng, 0.5, 0.95)), paint.wood(timber(rng))]
             out[k] = replace(out[k], paint=wall[rng.integers(len(wall))])
     for group in (synth_scene._window(), synth_scene._door(), synth_scene._pictures(rng)):
         if rng.random() < 0.75:
@@ -149,36 +149,36 @@ def _may_change(surface: Surface, rng: np.random.Generator) -> bool:
     return surface.emission == 0 and rng.random() < _REPAINTED
 
 
-def _colour(rng: np.random.Generator, low: float = 0.05, high: float = 0.95) -> paint.Colour:
+def colour(rng: np.random.Generator, low: float = 0.05, high: float = 0.95) -> paint.Colour:
     """A colour of random hue and mostly low saturation."""
     level = rng.uniform(low, high)
     r, g, b = np.clip(level * np.exp(rng.normal(0, 0.18, 3)), 0.02, 0.97)
     return (float(r), float(g), float(b))
 
 
-def _timber(rng: np.random.Generator) -> paint.Colour:
+def timber(rng: np.random.Generator) -> paint.Colour:
     """A colour of wood, from ebony to birch."""
     level = rng.uniform(0.18, 0.85)
     r, g, b = level * np.array([1.0, rng.uniform(0.68, 0.85), rng.uniform(0.42, 0.68)])
     return (float(r), float(g), float(b))
 
 
-def _grey(rng: np.random.Generator, low: float = 0.05, high: float = 0.95) -> paint.Colour:
+def grey(rng: np.random.Generator, low: float = 0.05, high: float = 0.95) -> paint.Colour:
     r, g, b = np.clip(rng.uniform(low, high) * np.exp(rng.normal(0, 0.05, 3)), 0.02, 0.97)
     return (float(r), float(g), float(b))
 
 
-def _any_paint(rng: np.random.Generator) -> Paint:
-    colour = _colour(rng)
-    paints = [paint.plain(colour), paint.plain(_grey(rng)), printed.book(colour), printed.cardboard(),
-              printed.poster(), paint.fabric(colour), paint.wood(_timber(rng)),
+def any_paint(rng: np.random.Generator) -> Paint:
+    of = colour(rng)
+    paints = [paint.plain(of), paint.plain(grey(rng)), printed.book(of), printed.cardboard(),
+              printed.poster(), paint.fabric(of), paint.wood(timber(rng)),
               printed.page()]  # fmt: skip
     return paints[rng.integers(len(paints))]
 
 
-def _block(rng: np.random.Generator, size_m: float) -> list[Surface]:
+def block(rng: np.random.Generator, size_m: float) -> list[Surface]:
     """A box, cylinder or ball of any material: sizes that say nothing, shapes that do."""
-    kind, chosen = rng.random(), _any_paint(rng)
+    kind, chosen = rng.random(), any_paint(rng)
     sx, sy, sz = size_m * np.exp(rng.uniform(-0.9, 0.9, 3))
     if kind < 0.5:
         return box((-sx / 2, -sy / 2, 0.0), (sx, sy, sz), chosen, yaw=rng.uniform(0, np.pi))
@@ -206,7 +206,7 @@ def _keyboard(rng: np.random.Generator) -> list[Surface]:
 
 
 def _laptop(rng: np.random.Generator) -> list[Surface]:
-    case = paint.plain(_grey(rng, 0.05, 0.75))
+    case = paint.plain(grey(rng, 0.05, 0.75))
     out = box((-0.17, -0.12, 0.0), (0.34, 0.24, 0.02), {"+z": printed.keyboard(), "*": case})
     lid = box((-0.17, 0.0, 0.0), (0.34, 0.01, 0.23), {"-y": printed.screen(), "*": case})
     A = so3_exp(np.array([-rng.uniform(0.1, 0.5), 0.0, 0.0]))
@@ -225,7 +225,7 @@ def _books(rng: np.random.Generator) -> list[Surface]:
     out, z = [], 0.0
     for _ in range(rng.integers(1, 6)):
         w, d, thick = rng.uniform(0.12, 0.22), rng.uniform(0.18, 0.30), rng.uniform(0.01, 0.05)
-        cover = {"+z": printed.poster(), "-y": printed.book(_colour(rng)), "*": _PALE}
+        cover = {"+z": printed.poster(), "-y": printed.book(colour(rng)), "*": _PALE}
         out += box((-w / 2, -d / 2, z), (w, d, thick), cover, yaw=rng.uniform(-0.4, 0.4))
         z += thick
     return out
@@ -234,43 +234,41 @@ def _books(rng: np.random.Generator) -> list[Surface]:
 def _binders(rng: np.random.Generator) -> list[Surface]:
     out: list[Surface] = []
     for k in range(rng.integers(1, 6)):
-        sides = {"-y": printed.book(_colour(rng)), "*": paint.plain(_colour(rng))}
+        sides = {"-y": printed.book(colour(rng)), "*": paint.plain(colour(rng))}
         out += box((0.08 * k, -0.14, 0.0), (0.075, 0.28, 0.32), sides)
     return out
 
 
 def _mug(rng: np.random.Generator) -> list[Surface]:
     return cylinder((0.0, 0.0, 0.0), rng.uniform(0.035, 0.045), rng.uniform(0.08, 0.11),
-                    paint.fabric(_colour(rng)), paint.plain((0.15, 0.1, 0.07)))  # fmt: skip
+                    paint.fabric(colour(rng)), paint.plain((0.15, 0.1, 0.07)))  # fmt: skip
 
 
 def _bottle(rng: np.random.Generator) -> list[Surface]:
     r, h = rng.uniform(0.03, 0.045), rng.uniform(0.18, 0.32)
     profile = [(0.012, h), (0.013, 0.88 * h), (r, 0.68 * h), (r, 0.0)]
-    return [lathe((0.0, 0.0, 0.0), profile, paint.plain(_colour(rng)))]
+    return [lathe((0.0, 0.0, 0.0), profile, paint.plain(colour(rng)))]
 
 
 def _lamp(rng: np.random.Generator) -> list[Surface]:
-    metal, h = paint.plain(_colour(rng), contrast=0.06), rng.uniform(0.3, 0.5)
+    metal, h = paint.plain(colour(rng), contrast=0.06), rng.uniform(0.3, 0.5)
     out = [*cylinder((0.0, 0.0, 0.0), 0.08, 0.02, metal), *cylinder((0.0, 0.0, 0.02), 0.01, h, metal)]
     return [*out, lathe((0.0, 0.0, h - 0.06), [(0.03, 0.14), (0.11, 0.0)], metal)]
 
 
 def _fruit(rng: np.random.Generator) -> list[Surface]:
     return [
-        ellipsoid(
-            (*rng.normal(0, 0.06, 2), 0.04), (0.04, 0.04, 0.04), paint.plain(_colour(rng), contrast=0.1)
-        )
+        ellipsoid((*rng.normal(0, 0.06, 2), 0.04), (0.04, 0.04, 0.04), paint.plain(colour(rng), contrast=0.1))
         for _ in range(rng.integers(1, 6))
     ]
 
 
 def _small_block(rng: np.random.Generator) -> list[Surface]:
-    return _block(rng, 0.12)
+    return block(rng, 0.12)
 
 
 def _chair(rng: np.random.Generator) -> list[Surface]:
-    cloth = [paint.fabric(_colour(rng, 0.05, 0.5)), _DARK, paint.wood(_timber(rng))]
+    cloth = [paint.fabric(colour(rng, 0.05, 0.5)), _DARK, paint.wood(timber(rng))]
     seat = cloth[rng.integers(len(cloth))]
     out = [*box((-0.23, -0.22, 0.42), (0.46, 0.44, 0.07), seat, bottom=True)]
     if rng.random() < 0.8:
@@ -290,7 +288,7 @@ def _chair(rng: np.random.Generator) -> list[Surface]:
     return out
 
 
-_THINGS: tuple[Callable[[np.random.Generator], list[Surface]], ...] = (
+THINGS: tuple[Callable[[np.random.Generator], list[Surface]], ...] = (
     _monitor, _monitor, _keyboard, _laptop, _paper, _paper, _books, _binders, _mug, _bottle, _lamp, _fruit,
     _small_block, _small_block,
 )  # fmt: skip

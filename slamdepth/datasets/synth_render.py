@@ -43,7 +43,7 @@ class Renderer:
         light = bake(_raycaster(solid), scene.surfaces, scene.lamps, texel_m, seed)
         self._atlas: Atlas = build_atlas(scene.surfaces, light, texel_m, seed)
         self._raycaster = _raycaster(scene.surfaces)
-        meshes = [_triangles(surface) for surface in scene.surfaces]
+        meshes = [surface.triangles for surface in scene.surfaces]
         self._corners = np.concatenate(
             [s.points.reshape(-1, 3)[t] for s, t in zip(scene.surfaces, meshes, strict=True)]
         )
@@ -141,16 +141,6 @@ class Renderer:
         return total / np.float32(len(taps))
 
 
-def _triangles(surface: Surface) -> NDArray[np.int64]:
-    """Triangles ``(T, 3)`` over the flattened grid of a surface."""
-    rows, columns = surface.points.shape[:2]
-    corner = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]
-    upper = np.stack([a, c, b], axis=-1).reshape(-1, 3)
-    lower = np.stack([b, c, d], axis=-1).reshape(-1, 3)
-    return np.concatenate([upper, lower])
-
-
 def _texels(surface: Surface, place: Place) -> Array:
     """Texel coordinates ``(rows * columns, 2)`` of a surface's grid points."""
     rows, columns = surface.points.shape[:2]
@@ -165,7 +155,7 @@ def _raycaster(surfaces: list[Surface]) -> Any:
     points, triangles, start = [], [], 0
     for surface in surfaces:
         points.append(surface.points.reshape(-1, 3))
-        triangles.append(_triangles(surface) + start)
+        triangles.append(surface.triangles + start)
         start += len(points[-1])
     scene.add_triangles(
         o3d.core.Tensor(np.concatenate(points).astype(np.float32)),

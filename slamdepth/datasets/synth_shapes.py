@@ -53,6 +53,16 @@ class Surface:
         flat = np.broadcast_to(mean / max(float(np.linalg.norm(mean)), 1e-12), normal.shape)
         return np.where(length > 1e-12, normal / np.maximum(length, 1e-12), flat)
 
+    @property
+    def triangles(self) -> NDArray[np.int64]:
+        """``(T, 3)`` over the flattened grid of points."""
+        rows, columns = self.points.shape[:2]
+        corner = np.arange(rows * columns).reshape(rows, columns)
+        a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]
+        upper = np.stack([a, c, b], axis=-1).reshape(-1, 3)
+        lower = np.stack([b, c, d], axis=-1).reshape(-1, 3)
+        return np.concatenate([upper, lower])
+
 
 def quad(
     origin: Array | tuple[float, float, float],
