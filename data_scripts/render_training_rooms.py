@@ -4,9 +4,10 @@
 The rooms are those of ``data_scripts/training_rooms.py``. Views are chosen for variety,
 not for a smooth path: a random point, often one on a table, is looked at from a random
 distance and direction, down to almost straight from above, half of the time with a rolled
-camera. With ``--plain`` the rooms have little texture, and in half of the views the camera is where one
-holds a phone standing or sitting, and looks about. Same arguments, same files; rooms that are there
-already are kept.
+camera. With ``--furniture`` they are those of ``data_scripts/furnished_rooms.py`` instead, and in a quarter
+of the views the camera is where one holds a phone standing or sitting, and looks about. With ``--plain``
+the rooms have little texture, and half of the views are of that kind. Same arguments, same files; rooms
+that are there already are kept.
 
     python data_scripts/render_training_rooms.py OUT --rooms 30 --views 20 --first-seed 1000
 """
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -23,6 +25,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+from furnished_rooms import furnished_scene
+from furniture_models import Mesh, Piece, read_catalogues
+from mesh_render import MeshRenderer
 from training_rooms import UP, plain_scene, varied_scene
 
 from slamdepth.datasets.synth_render import Renderer
@@ -32,7 +37,9 @@ from slamdepth.types import Camera
 WIDTH, HEIGHT = 336, 252
 TEXEL_M = 0.004
 BLANK = 1.25  # a plain room's view of smaller relief is a piece of wall, which tells nothing
-HELD = 0.5  # share of a plain room's views
+PLAIN_HELD, FURNISHED_HELD = 0.5, 0.25  # share of a room's views
+SPREAD = 20_000
+FEWEST_MATERIALS = 5  # of a furnished room's view
 TABLE_M = (0.6, 1.0)  # heights at which things stand on tables
 
 
@@ -71,22 +78,38 @@ def held(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.n
     return position, position + forward
 
 
+def spread(mesh: Mesh, rng: np.random.Generator) -> np.ndarray:
+    """Points ``(N, 3)`` on a mesh: large triangles more often, though not by their area."""
+    sides = mesh.corners[:, 1:] - mesh.corners[:, :1]
+    weight = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) ** 0.5
+    chosen = rng.choice(len(weight), SPREAD, p=weight / weight.sum())
+    a, b = np.sort(rng.random((2, SPREAD, 1)), axis=0)
+    corners = mesh.corners[chosen]
+    return np.asarray(corners[:, 0] * a + corners[:, 1] * (b - a) + corners[:, 2] * (1 - b), dtype=float)
+
+
 def room_views(
-    seed: int, count: int, focal_px: float, *, plain: bool = False
+    seed: int, count: int, focal_px: float, *, plain: bool = False, pieces: Sequence[Piece] = ()
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """``count`` pairs of image ``(H, W, 3)`` uint8 RGB and depth ``(H, W)`` metres of one room."""
     camera = Camera(WIDTH, HEIGHT, focal_px, focal_px, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
     rng = np.random.default_rng([seed, 11])
-    scene = plain_scene(seed) if plain else varied_scene(seed)
-    renderer = Renderer(scene, camera, TEXEL_M, seed)
-    points = np.concatenate([s.points[::8, ::8].reshape(-1, 3) for s in scene.surfaces])
+    if pieces:
+        furnished = furnished_scene(seed, pieces)
+        renderer: Renderer | MeshRenderer = MeshRenderer(furnished, camera, seed)
+        points = spread(furnished.mesh, rng)
+    else:
+        scene = plain_scene(seed) if plain else varied_scene(seed)
+        renderer = Renderer(scene, camera, TEXEL_M, seed)
+        points = np.concatenate([s.points[::8, ::8].reshape(-1, 3) for s in scene.surfaces])
+    often_held = PLAIN_HELD if plain else FURNISHED_HELD if pieces else 0.0
     on_tables = points[(points[:, 2] > TABLE_M[0]) & (points[:, 2] < TABLE_M[1])]
     low, high = points.min(axis=0), points.max(axis=0)
     views: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(60 * count):
         if len(views) == count:
             break
-        is_held = plain and rng.random() < HELD
+        is_held = often_held > 0 and rng.random() < often_held
         position, target = held(points, rng) if is_held else aimed(points, on_tables, rng)
         if (position < low + 0.25).any() or (position > high - 0.2).any():
             continue
@@ -98,7 +121,9 @@ def room_views(
         known = depth[(depth > 0) & np.isfinite(depth)]
         if len(known) < depth.size or np.percentile(known, 1) < 0.2 or known.max() > 12:
             continue
-        if plain and np.percentile(known, 95) < BLANK * np.percentile(known, 5):
+        if often_held and np.percentile(known, 95) < BLANK * np.percentile(known, 5):
+            continue
+        if isinstance(renderer, MeshRenderer) and renderer.materials_seen(T_world_camera) < FEWEST_MATERIALS:
             continue
         colour, depth = renderer.render(T_world_camera)
         noise = rng.normal(0, rng.uniform(0, 3), colour.shape)
@@ -115,7 +140,15 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--focal-px", type=float, default=265.0, help=f"at {WIDTH} x {HEIGHT} pixels")
     parser.add_argument("--plain", action="store_true", help="little texture, half of it as held by hand")
+    parser.add_argument("--furniture", type=Path, metavar="DIR",
+                        help="rooms of these pieces instead, see furniture_models.py")  # fmt: skip
     arguments = parser.parse_args()
+    if arguments.furniture and arguments.plain:
+        parser.error("--plain repaints the rooms without --furniture; leave one of them out")
+    pieces = read_catalogues(arguments.furniture) if arguments.furniture else []
+    if arguments.furniture and not pieces:
+        parser.error(f"--furniture {arguments.furniture}: no catalogue with models in a folder of it; "
+                     "data_scripts/furniture_models.py says how to get them")  # fmt: skip
     folder, focal_px = arguments.output, arguments.focal_px
     folder.mkdir(parents=True, exist_ok=True)
     about = {"width": WIDTH, "height": HEIGHT, "fx": focal_px, "fy": focal_px,
@@ -124,7 +157,9 @@ def main() -> None:
     for room in range(arguments.rooms):
         done = folder / f".{room:05d}.done"
         if not done.exists():
-            pairs = room_views(arguments.first_seed + room, arguments.views, focal_px, plain=arguments.plain)
+            pairs = room_views(
+                arguments.first_seed + room, arguments.views, focal_px, plain=arguments.plain, pieces=pieces
+            )
             for index, (image, depth) in enumerate(pairs):
                 name = folder / f"{room * 1000 + index:05d}"
                 cv2.imwrite(f"{name}.png", np.clip(np.round(depth * 1000), 0, 65535).astype(np.uint16))
