@@ -59,10 +59,10 @@ def furnished_scene(seed: int, pieces: Sequence[Piece]) -> MeshScene:
         if put is not None:
             meshes += [_mesh(s, rng).moved(*put) for s in workplace(rng)]
     for _ in range(int(np.clip(room[0] * room[1] * rng.uniform(0.5, 1.4), 5, 28))):
-        piece = stock.large()
-        mesh = load_mesh(piece) if piece else None
-        if piece is None or mesh is None:
+        found = stock.large()
+        if found is None:
             continue
+        piece, mesh = found
         likes_walls = piece.size_m[2] > 1.2 or piece.elevation_m > _HUNG_M
         put = _placed(piece, room, taken, rng.random() < (0.8 if likes_walls else 0.5), rng)
         if put is None:
@@ -96,13 +96,20 @@ class _Stock:
         )
         self._large, self._chance = [*large, *people], chance / max(chance.sum(), 1e-9)
 
-    def large(self) -> Piece | None:
-        """Something that stands on the floor or hangs; None where the catalogues have nothing."""
-        return self._large[self._rng.choice(len(self._large), p=self._chance)] if self._large else None
+    def large(self) -> tuple[Piece, Mesh] | None:
+        """Something that stands on the floor or hangs; None where it has no mesh, or there is nothing."""
+        return (
+            _loaded(self._large[self._rng.choice(len(self._large), p=self._chance)]) if self._large else None
+        )
 
-    def small(self) -> Piece | None:
-        """Something that stands on other things."""
-        return self._small[self._rng.integers(len(self._small))] if self._small else None
+    def small(self) -> tuple[Piece, Mesh] | None:
+        """The same of what stands on other things."""
+        return _loaded(self._small[self._rng.integers(len(self._small))]) if self._small else None
+
+
+def _loaded(piece: Piece) -> tuple[Piece, Mesh] | None:
+    mesh = load_mesh(piece)
+    return None if mesh is None else (piece, mesh)
 
 
 def _placed(
@@ -114,11 +121,11 @@ def _placed(
     for _ in range(_TRIES):
         if at_wall or is_hung:
             angle, wall = _WALLS[rng.integers(len(_WALLS))]
-            half = size[:2] / 2 if wall[0] == 0 else size[1::-1] / 2
+            side = np.array(wall)
+            half = size[:2] / 2 if side[0] == 0 else size[1::-1] / 2
             xy = rng.uniform(half, np.maximum(room[:2] - half, half + 1e-3))
-            xy = np.where(
-                np.array(wall) > 0, room[:2] - half - 0.01, np.where(np.array(wall) < 0, half + 0.01, xy)
-            )
+            at_side = np.where(side > 0, room[:2] - half - 0.01, half + 0.01)
+            xy = np.where(side == 0, xy, at_side)
         else:
             angle = rng.uniform(-np.pi, np.pi) if rng.random() < 0.5 else rng.integers(4) * np.pi / 2
             c, s = abs(np.cos(angle)), abs(np.sin(angle))
@@ -149,9 +156,9 @@ def _laden(
     for _ in range(3 * wanted):
         if len(spots) >= wanted:
             break
-        thing = stock.small() if rng.random() < 0.55 else None
-        mesh = load_mesh(thing) if thing else None
-        if thing is not None and mesh is not None:
+        found = stock.small() if rng.random() < 0.55 else None
+        if found is not None:
+            thing, mesh = found
             meshes, radius = [_varied(mesh, rng)], max(thing.size_m[:2]) / 2
         else:
             meshes, radius = [_mesh(s, rng) for s in THINGS[rng.integers(len(THINGS))](rng)], 0.16
@@ -185,24 +192,27 @@ def _varied(mesh: Mesh, rng: np.random.Generator) -> Mesh:
 
 def _mesh(surface: Surface, rng: np.random.Generator) -> Mesh:
     """A painted surface of ``slamdepth synth`` as triangles."""
-    rows, columns = surface.points.shape[:2]
-    u, v = np.meshgrid(np.linspace(0.01, 0.99, columns), np.linspace(0.01, 0.99, rows))
-    uv = np.stack([u, v], axis=-1).reshape(-1, 2)
     along, down = (int(np.clip(s / _TEXEL_M, 4, _LARGEST_TEXELS)) for s in surface.size_m)
-    image = np.asarray(surface.paint(rng, down, along, surface.size_m[0] / along), np.float32)
-    triangles = surface.triangles
-    return Mesh(
-        surface.points.reshape(-1, 3)[triangles], uv[triangles], np.zeros(len(triangles), np.int32),
-        (Material(image, surface.emission),),
-    )  # fmt: skip
+    image = surface.paint(rng, down, along, surface.size_m[0] / along)
+    return _textured(surface, image, np.array([[0.01, 0.01], [0.99, 0.99]]))
 
 
 def _tiled(surface: Surface, rng: np.random.Generator) -> Mesh:
     """A wall, whose texture repeats."""
     side = int(_TILE_M / _TEXEL_M)
-    image = np.asarray(surface.paint(rng, side, side, _TEXEL_M), np.float32)
-    plain = _mesh(replace(surface, paint=lambda *_: image), rng)
-    return replace(plain, uv=(plain.uv - 0.01) / 0.98 * np.array(surface.size_m) / _TILE_M)
+    image = surface.paint(rng, side, side, _TEXEL_M)
+    return _textured(surface, image, np.array([[0.0, 0.0], surface.size_m]) / _TILE_M)
+
+
+def _textured(surface: Surface, image: np.ndarray, uv: np.ndarray) -> Mesh:
+    """``surface`` as triangles; ``uv (2, 2)`` are the points of ``image`` at its first and last corner."""
+    rows, columns = surface.points.shape[:2]
+    u, v = np.linspace(*uv[:, 0], columns), np.linspace(*uv[:, 1], rows)
+    at = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    triangles = surface.triangles
+    material = Material(np.asarray(image, np.float32), surface.emission)
+    corners = surface.points.reshape(-1, 3)[triangles]
+    return Mesh(corners, at[triangles], np.zeros(len(triangles), np.int32), (material,))
 
 
 @dataclass(frozen=True)

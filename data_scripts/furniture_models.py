@@ -127,7 +127,8 @@ def _piece(root: Path, entry: dict[str, str]) -> Piece | None:
 @functools.lru_cache(maxsize=300)
 def load_mesh(piece: Piece) -> Mesh | None:
     """Its mesh at its size, centred over the origin; None where the file has no faces."""
-    corners, uv, names = _read_obj(piece.model)
+    text = piece.model.read_text(encoding="latin-1")
+    corners, uv, names = _triangles(text)
     if not len(corners):
         return None
     corners = corners @ np.array(piece.rotation).T
@@ -136,7 +137,7 @@ def load_mesh(piece: Piece) -> Mesh | None:
     scale = np.array([width, height, depth]) / np.maximum(high - low, 1e-6)
     corners = (corners - [(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2]) * scale
     corners = corners[..., [0, 2, 1]] * [1.0, -1.0, 1.0]  # y up, front at +z: z up, front at -y
-    known = _read_materials(piece.model)
+    known = _materials(text, piece.model.parent)
     unique, index = np.unique(names, return_inverse=True)
     materials = [known.get(name, Material(np.full((1, 1, 3), 0.6, np.float32))) for name in unique]
     shown = np.array([material is not None for material in materials])[index]
@@ -144,14 +145,14 @@ def load_mesh(piece: Piece) -> Mesh | None:
     return Mesh(corners[shown], uv[shown], index[shown], solid) if shown.any() else None
 
 
-def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners ``(T, 3, 3)``, their image points ``(T, 3, 2)`` and material names ``(T,)``."""
+def _triangles(text: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of an OBJ file: corners ``(T, 3, 3)``, their image points ``(T, 3, 2)`` and material names ``(T,)``."""
     points: list[list[float]] = []
     images: list[list[float]] = [[0.0, 0.0]]
     triangles: list[tuple[int, ...]] = []
     names: list[str] = []
     name = ""
-    for line in path.read_text(encoding="latin-1").replace("\\\n", " ").splitlines():
+    for line in text.replace("\\\n", " ").splitlines():
         word, _, rest = line.partition(" ")
         if word == "v":
             points.append([float(x) for x in rest.split()[:3]])
@@ -176,11 +177,11 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(points)[indices[..., 0]], np.array(images)[indices[..., 1]], np.array(names)
 
 
-def _read_materials(model: Path) -> dict[str, Material | None]:
-    """Of the MTL files that ``model`` names; None for what is seen through."""
+def _materials(text: str, folder: Path) -> dict[str, Material | None]:
+    """Of the MTL files in ``folder`` that an OBJ file names; None for what is seen through."""
     found: dict[str, Material | None] = {}
-    for name in re.findall(r"^mtllib (.+?)\s*$", model.read_text(encoding="latin-1"), re.MULTILINE):
-        file = model.parent / name
+    for name in re.findall(r"^mtllib (.+?)\s*$", text, re.MULTILINE):
+        file = folder / name
         if not file.is_file():
             continue
         for block in re.split(r"^newmtl ", file.read_text(encoding="latin-1"), flags=re.MULTILINE)[1:]:

@@ -7,6 +7,7 @@ Light is computed where a view's rays arrive, so a room costs nothing before its
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -63,27 +64,25 @@ class MeshRenderer:
     def depth(self, T_world_camera: np.ndarray) -> np.ndarray:
         """Depth along z ``(H, W)`` in metres; infinite where there is nothing."""
         rays = self._rays(T_world_camera, 1)
-        depth: np.ndarray = self._raycaster.cast_rays(import_open3d().core.Tensor(rays))["t_hit"].numpy()
+        depth: np.ndarray = self._cast(rays)["t_hit"].numpy()
         return depth.reshape(self._camera.height, self._camera.width)
 
     def materials_seen(self, T_world_camera: np.ndarray) -> int:
         """How many different materials a view shows on more than a few of its rays."""
         rays = self._rays(T_world_camera, 1)[::_SPARSE]
-        hit = self._raycaster.cast_rays(import_open3d().core.Tensor(rays))["primitive_ids"].numpy()
+        hit = self._cast(rays)["primitive_ids"].numpy()
         hit = hit[hit < len(self._scene.mesh.material)]
         return int((np.bincount(self._scene.mesh.material[hit]) > _FEW_RAYS).sum())
 
     def render(self, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Colours ``(H, W, 3)`` sRGB 0 to 255 and depth along z ``(H, W)`` in metres."""
         height, width = self._camera.height, self._camera.width
-        cast = self._raycaster.cast_rays
         rays = self._rays(T_world_camera, 1)
-        hits = cast(import_open3d().core.Tensor(rays))
+        hits = self._cast(rays)
         depth = hits["t_hit"].numpy()
         light = self._light(rays, depth, hits["primitive_ids"].numpy()).reshape(height, width, 3)
         light = cv2.blur(light.astype(np.float32), (3, 3))
-        fine_rays = self._rays(T_world_camera, _FINER)
-        fine = cast(import_open3d().core.Tensor(fine_rays))
+        fine = self._cast(self._rays(T_world_camera, _FINER))
         albedo, glow = self._albedo(
             fine["primitive_ids"].numpy(), fine["primitive_uvs"].numpy(), fine["t_hit"].numpy()
         )
@@ -94,6 +93,9 @@ class MeshRenderer:
         colour = self._developed(linear.astype(np.float32))
         colour = cv2.resize(colour, (width, height), interpolation=cv2.INTER_AREA)
         return colour * 255, depth.reshape(height, width)
+
+    def _cast(self, rays: np.ndarray) -> Any:
+        return self._raycaster.cast_rays(import_open3d().core.Tensor(rays))
 
     def _rays(self, T_world_camera: np.ndarray, finer: int) -> np.ndarray:
         """Rays ``(N, 6)`` of unit z through ``finer`` points a pixel's side."""
