@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a rolled camera costs predicted depth: the same frames as taken, and turned upright by true poses.
 
+Where a model finds out which way is down itself, it is also told the true direction, and how often it
+finds it is counted.
+
 python -m benchmarks.depth_roll rgbd_dataset_freiburg1_rpy --output roll.json
 
 The true roll is of the ground truth, whose world has to have a vertical axis (TUM's is z). An image is
@@ -17,7 +20,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
@@ -29,30 +31,32 @@ from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.evaluate import judge_depth
 from slamdepth.depth.registry import create_depth_model
+from slamdepth.depth.turning import roll_rad, turned, turned_back
 from slamdepth.errors import DatasetError
 from slamdepth.evaluation import DepthJudge, DepthJudgement
 from slamdepth.io import write_json
 from slamdepth.pipeline.depth_data import readable, thinned
 from slamdepth.pipeline.training_data import SequencePlace
-from slamdepth.types import Camera, DepthPrediction, Frame, Trajectory
+from slamdepth.types import DepthPrediction, Frame, Trajectory
 
 _FARTHEST_S = 0.05
+_WITHIN_DEG = 20
 
 
-def roll_rad(T_world_camera: NDArray[np.float64], up_w: NDArray[np.float64]) -> float:
-    """Angle of "down" in the image from its vertical axis, positive towards the right side."""
-    down_c = T_world_camera[:3, :3].T @ -up_w
-    return float(np.arctan2(down_c[0], down_c[1]))
+def pose_near(truth: Trajectory, frame: Frame) -> NDArray[np.float64] | None:
+    """``T_world_camera (4, 4)`` of the true pose nearest in time; None where there is none near."""
+    k = int(np.argmin(np.abs(truth.timestamps_s - frame.timestamp_s)))
+    if abs(float(truth.timestamps_s[k]) - frame.timestamp_s) > _FARTHEST_S:
+        return None
+    return truth.T_world_camera[k]
 
 
 def true_roll(truth: Trajectory, up_w: NDArray[np.float64]) -> Callable[[Frame], float | None]:
     """The roll of a frame by the true pose nearest in time; None where there is none near."""
 
     def roll(frame: Frame) -> float | None:
-        k = int(np.argmin(np.abs(truth.timestamps_s - frame.timestamp_s)))
-        if abs(float(truth.timestamps_s[k]) - frame.timestamp_s) > _FARTHEST_S:
-            return None
-        return roll_rad(truth.T_world_camera[k], up_w)
+        T_world_camera = pose_near(truth, frame)
+        return None if T_world_camera is None else roll_rad(T_world_camera[:3, :3].T @ -up_w)
 
     return roll
 
@@ -68,32 +72,7 @@ def predicted_upright(
     """
     image = turned(frame.image_rgb, frame.camera, -angle_rad)
     upright = model.predict(replace(frame, image_rgb=image, depth_m=None))
-    values = turned_back(upright.values, otherwise.values, frame.camera, angle_rad)
-    sigma = upright.sigma_log
-    if sigma is not None and otherwise.sigma_log is not None:
-        sigma = turned_back(sigma, otherwise.sigma_log, frame.camera, angle_rad)
-    return replace(otherwise, values=values, sigma_log=sigma)
-
-
-def turned(image_rgb: NDArray[np.uint8], camera: Camera, angle_rad: float) -> NDArray[np.uint8]:
-    """An image turned about its principal point, its border mirrored."""
-    out = _warped(image_rgb, camera, angle_rad, cv2.INTER_LINEAR, cv2.BORDER_REFLECT_101)
-    return np.asarray(out, dtype=np.uint8)
-
-
-def turned_back(
-    values: NDArray[np.float32], otherwise: NDArray[np.float32], camera: Camera, angle_rad: float
-) -> NDArray[np.float32]:
-    """A map of a turned image for the image as taken, ``otherwise`` where that was cut off."""
-    out = _warped(values, camera, angle_rad, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
-    return np.where(out > 0, out, otherwise).astype(np.float32)
-
-
-def _warped(
-    image: NDArray[Any], camera: Camera, angle_rad: float, interpolation: int, border: int
-) -> NDArray[Any]:
-    M = cv2.getRotationMatrix2D((camera.cx, camera.cy), np.degrees(angle_rad), 1.0)
-    return np.asarray(cv2.warpAffine(image, M, image.shape[1::-1], flags=interpolation, borderMode=border))
+    return turned_back(upright, otherwise, frame.camera, angle_rad)
 
 
 def judged(
@@ -120,6 +99,34 @@ def judged(
     turned_upright = upright.judge()
     assert turned_upright is not None
     return as_taken, turned_upright
+
+
+def judged_knowing(
+    dataset: Dataset, model: DepthModel, up_w: NDArray[np.float64], stride: int
+) -> tuple[DepthJudgement, list[float]]:
+    """Depth by a model that is told the true direction of gravity, and how far off, in degrees, the one it
+    finds itself is: 180 where it finds none. Frames without a true pose are left out of both.
+
+    Raises:
+        DatasetError: the sequence has no ground truth or no depth.
+    """
+    if dataset.ground_truth is None:
+        raise DatasetError(f"{dataset.path}: has no ground truth to tell gravity by; leave it out")
+    place = SequencePlace.of(dataset)
+    judge, errors_deg = DepthJudge(model.kind), []
+    for frame in readable(place, thinned(place, stride)):
+        T_world_camera = pose_near(dataset.ground_truth, frame)
+        if T_world_camera is None or frame.depth_m is None:
+            continue
+        down = T_world_camera[:3, :3].T @ -up_w
+        found = model.predict(frame).gravity
+        cosine = -1.0 if found is None else float(np.clip(found @ down, -1.0, 1.0))
+        errors_deg.append(float(np.degrees(np.arccos(cosine))))
+        judge.add(model.predict(replace(frame, gravity=down)), frame.depth_m)
+    judgement = judge.judge()
+    if judgement is None:
+        raise DatasetError(f"{dataset.path}: no frame with depth has a true pose near in time")
+    return judgement, errors_deg
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
@@ -156,17 +163,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     rows: list[dict[str, Any]] = []
     up_w = np.array(options.up)
+    found: list[str] = []
+    down_errors: dict[str, list[float]] = {}
     model = create_depth_model("dinov2")
     for path in options.sequences:
         dataset = open_dataset(path)
         with Console(stderr=True).status(f"{dataset.name}: predicting"):
-            found = judged(dataset, model, up_w, options.stride)
-        for label, judgement in zip(("as taken", "turned upright"), found, strict=True):
+            both = judged(dataset, model, up_w, options.stride)
+        for label, judgement in zip(("as taken", "turned upright"), both, strict=True):
             rows.append({"sequence": dataset.name, "images": label, **judgement.to_dict()})
+        told, errors_deg = judged_knowing(dataset, model, up_w, options.stride)
+        rows.append({"sequence": dataset.name, "images": "told which way is down", **told.to_dict()})
+        found.append(
+            f"{dataset.name}: found which way is down to {_WITHIN_DEG} degrees in "
+            f"{np.mean(np.array(errors_deg) <= _WITHIN_DEG):.0%} of {len(errors_deg)} images, "
+            f"half of them to {np.median(errors_deg):.0f} degrees"
+        )
+        down_errors[dataset.name] = errors_deg
     if options.output:
         weights = [asdict(info) for info in model.weights]
-        write_json(options.output, {"environment": environment(), "weights": weights, "rows": rows})
+        write_json(
+            options.output,
+            {"environment": environment(), "weights": weights, "rows": rows, "down_errors_deg": down_errors},
+        )
     print(table(rows))
+    print(*found, sep="\n")
     return 0
 
 

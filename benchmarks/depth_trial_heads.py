@@ -40,9 +40,11 @@ class LinearHead(nn.Module):
         self.drop = nn.Dropout2d(dropout)
         self.out = _output(2 * len(shape.taps) * shape.token_dim)
 
-    def coarse(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`slamdepth.depth.head.DepthHead.coarse`."""
-        del image
+    def coarse(
+        self, tokens: Tensor, class_tokens: Tensor, image: Tensor, field: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """As :meth:`slamdepth.depth.head.DepthHead.coarse`, without gravity."""
+        del image, field
         x, cls = tokens.flatten(1, 2), class_tokens.flatten(1)[..., None, None]
         x = self.drop(torch.cat([x, cls.expand(-1, -1, *x.shape[2:])], dim=1))
         return F.interpolate(self.out(x), scale_factor=2, mode="bilinear", align_corners=False), x
@@ -62,8 +64,11 @@ class DptLikeHead(nn.Module):
         self.last = nn.Conv2d(_DPT_CHANNELS, 32, 3, padding=1)
         self.out = _output(32)
 
-    def coarse(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`slamdepth.depth.head.DepthHead.coarse`."""
+    def coarse(
+        self, tokens: Tensor, class_tokens: Tensor, image: Tensor, field: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """As :meth:`slamdepth.depth.head.DepthHead.coarse`, without gravity."""
+        del image, field
         rows, columns = tokens.shape[-2:]
         grids = [(2 * rows, 2 * columns)] + [(rows, columns)] * (tokens.shape[1] - 2)
         grids.append(((rows + 1) // 2, (columns + 1) // 2))

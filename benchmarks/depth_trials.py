@@ -33,10 +33,10 @@ from benchmarks.summary import environment
 from slamdepth.depth.head import DepthHead, HeadShape
 from slamdepth.depth.training.caches import Encoder, fill_cache, open_encoder, plan_caches
 from slamdepth.depth.training.config import TrainConfig, digest
-from slamdepth.depth.training.features import FeatureCache, load_batch
+from slamdepth.depth.training.features import FeatureCache, load_batch, load_mixed_batch
 from slamdepth.depth.training.loop import head_shape, learning_rate
-from slamdepth.depth.training.losses import total_loss
-from slamdepth.depth.training.stages import coarse_target, predict
+from slamdepth.depth.training.losses import taught, total_loss
+from slamdepth.depth.training.stages import coarse_target, not_always_told, predict
 from slamdepth.io import write_json
 
 _GROUPS = 3
@@ -120,10 +120,11 @@ def train_head(
         )
         for step in range(steps):
             chosen = samples[order.choice(len(samples), min(config.batch, len(samples)), replace=False)]
-            parts = [load_batch(caches[c], np.sort(chosen[chosen[:, 0] == c, 1]), "cpu")
-                     for c in np.unique(chosen[:, 0])]  # fmt: skip
-            tokens, class_tokens, image, depth = (torch.cat(part) for part in zip(*parts, strict=True))
-            prediction, target = predict(head, (tokens, class_tokens, image, depth), False)
+            batch, teaches = load_mixed_batch(caches, chosen, "cpu")
+            if config.head.gravity:
+                batch = not_always_told(batch, config.head.unknown_gravity)
+            prediction, target = predict(head, batch, False)
+            prediction = taught(prediction, target, teaches)
             loss = (
                 trial.loss(prediction, target) if trial.loss else total_loss(prediction, target, config.loss)
             )
@@ -142,9 +143,9 @@ def judge_head(head: nn.Module, cache: FeatureCache) -> dict[str, float]:
     errors = []
     for start in range(0, len(cache), _AT_ONCE):
         chosen = np.arange(start, min(start + _AT_ONCE, len(cache)))
-        tokens, class_tokens, image, depth = load_batch(cache, chosen, "cpu")
+        tokens, class_tokens, image, field, depth = load_batch(cache, chosen, "cpu")
         with torch.inference_mode():
-            log_depth = head.coarse(tokens, class_tokens, image)[0][:, 0]
+            log_depth = head.coarse(tokens, class_tokens, image, field)[0][:, 0]
         for predicted, target in zip(log_depth, coarse_target(depth), strict=True):
             known = target > 0
             if int(known.sum()) >= _FEWEST_CELLS:

@@ -32,6 +32,7 @@ from training_rooms import UP, plain_scene, varied_scene
 
 from slamdepth.datasets.synth_render import Renderer
 from slamdepth.geometry import so3_exp
+from slamdepth.io import write_text
 from slamdepth.types import Camera
 
 WIDTH, HEIGHT = 336, 252
@@ -78,6 +79,23 @@ def held(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.n
     return position, position + forward
 
 
+def filmed(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The same of somebody who stands or sits and films things within reach and beyond.
+
+    How far away a thing is goes with how steeply it is seen, as it does where a camera is held by hand.
+    """
+    height = rng.normal(1.5, 0.15) if rng.random() < 0.6 else rng.normal(1.15, 0.12)
+    if rng.random() < 0.3:
+        low, high = points.min(axis=0), points.max(axis=0)
+        position = np.append(rng.uniform(low[:2], high[:2]), height)
+        elevation, azimuth = np.radians(rng.normal(-10.0, 13.0)), rng.uniform(-np.pi, np.pi)
+        return position, position + np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
+    target = points[rng.integers(len(points))] + rng.normal(0, 0.15, 3)
+    distance, azimuth = np.exp(rng.uniform(np.log(0.25), np.log(3.0))), rng.uniform(-np.pi, np.pi)
+    position = np.append(target[:2] + distance * np.array([np.cos(azimuth), np.sin(azimuth)]), height)
+    return position, target
+
+
 def spread(mesh: Mesh, rng: np.random.Generator) -> np.ndarray:
     """Points ``(N, 3)`` on a mesh: large triangles more often, though not by their area."""
     sides = mesh.corners[:, 1:] - mesh.corners[:, :1]
@@ -89,9 +107,16 @@ def spread(mesh: Mesh, rng: np.random.Generator) -> np.ndarray:
 
 
 def room_views(
-    seed: int, count: int, focal_px: float, *, plain: bool = False, pieces: Sequence[Piece] = ()
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """``count`` pairs of image ``(H, W, 3)`` uint8 RGB and depth ``(H, W)`` metres of one room."""
+    seed: int,
+    count: int,
+    focal_px: float,
+    *,
+    plain: bool = False,
+    pieces: Sequence[Piece] = (),
+    by_hand: bool = False,
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """``count`` views of one room: image ``(H, W, 3)`` uint8 RGB, depth ``(H, W)`` metres, and the
+    direction of gravity ``(3,)`` in the camera's frame."""
     camera = Camera(WIDTH, HEIGHT, focal_px, focal_px, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
     rng = np.random.default_rng([seed, 11])
     if pieces:
@@ -105,12 +130,15 @@ def room_views(
     often_held = PLAIN_HELD if plain else FURNISHED_HELD if pieces else 0.0
     on_tables = points[(points[:, 2] > TABLE_M[0]) & (points[:, 2] < TABLE_M[1])]
     low, high = points.min(axis=0), points.max(axis=0)
-    views: list[tuple[np.ndarray, np.ndarray]] = []
+    views: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for _ in range(60 * count):
         if len(views) == count:
             break
-        is_held = often_held > 0 and rng.random() < often_held
-        position, target = held(points, rng) if is_held else aimed(points, on_tables, rng)
+        is_held = by_hand or (often_held > 0 and rng.random() < often_held)
+        if by_hand:
+            position, target = filmed(points, rng)
+        else:
+            position, target = held(points, rng) if is_held else aimed(points, on_tables, rng)
         if (position < low + 0.25).any() or (position > high - 0.2).any():
             continue
         rolled = not is_held and rng.random() < 0.5
@@ -127,8 +155,23 @@ def room_views(
             continue
         colour, depth = renderer.render(T_world_camera)
         noise = rng.normal(0, rng.uniform(0, 3), colour.shape)
-        views.append((np.clip(colour + noise, 0, 255).astype(np.uint8), depth))
+        down = -T_world_camera[:3, :3].T @ UP
+        views.append((np.clip(colour + noise, 0, 255).astype(np.uint8), depth, down))
     return views
+
+
+def write_gravity(folder: Path, rooms: int) -> None:
+    """``gravity.txt`` of what the rooms' notes say: a view's name and the direction of gravity in its camera.
+
+    Raises:
+        ValueError: a room was rendered before notes said so.
+    """
+    notes = [folder / f".{room:05d}.done" for room in range(rooms)]
+    for room, note in enumerate(notes):
+        if not note.read_text(encoding="utf-8") and (folder / f"{room * 1000:05d}.png").exists():
+            raise ValueError(f"{note}: does not say where down is; delete it to render the room again")
+    lines = "".join(note.read_text(encoding="utf-8") for note in notes)
+    write_text(folder / "gravity.txt", lines)
 
 
 def main() -> None:
@@ -140,6 +183,9 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--focal-px", type=float, default=265.0, help=f"at {WIDTH} x {HEIGHT} pixels")
     parser.add_argument("--plain", action="store_true", help="little texture, half of it as held by hand")
+    parser.add_argument(
+        "--by-hand", action="store_true", help="every view as somebody who stands or sits would film it"
+    )
     parser.add_argument("--furniture", type=Path, metavar="DIR",
                         help="rooms of these pieces instead, see furniture_models.py")  # fmt: skip
     arguments = parser.parse_args()
@@ -157,15 +203,22 @@ def main() -> None:
     for room in range(arguments.rooms):
         done = folder / f".{room:05d}.done"
         if not done.exists():
-            pairs = room_views(
-                arguments.first_seed + room, arguments.views, focal_px, plain=arguments.plain, pieces=pieces
-            )
-            for index, (image, depth) in enumerate(pairs):
+            views = room_views(
+                arguments.first_seed + room, arguments.views, focal_px,
+                plain=arguments.plain, pieces=pieces, by_hand=arguments.by_hand,
+            )  # fmt: skip
+            lines = []
+            for index, (image, depth, down) in enumerate(views):
                 name = folder / f"{room * 1000 + index:05d}"
+                lines.append(f"{name.name} {down[0]:.6f} {down[1]:.6f} {down[2]:.6f}\n")
                 cv2.imwrite(f"{name}.png", np.clip(np.round(depth * 1000), 0, 65535).astype(np.uint16))
                 cv2.imwrite(f"{name}.jpg", image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 93])
-            done.touch()
+            done.write_text("".join(lines), encoding="utf-8")
         print(f"room {room + 1} of {arguments.rooms}", flush=True)
+    try:
+        write_gravity(folder, arguments.rooms)
+    except ValueError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

@@ -113,6 +113,8 @@ class Frame:
         camera: the camera that took it.
         depth_m: ``(H, W)`` float32 sensor depth in metres registered to the colour
             image, 0 where unknown; None where the sequence has none.
+        gravity: ``(3,)`` unit direction of gravity in the camera's frame (x right, y down, z forward), as an
+            accelerometer tells it; None where it is not known. Depth models may use it.
     """
 
     index: int
@@ -120,6 +122,7 @@ class Frame:
     image_rgb: NDArray[np.uint8]
     camera: Camera
     depth_m: NDArray[np.float32] | None = None
+    gravity: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         expected = (self.camera.height, self.camera.width, 3)
@@ -154,12 +157,16 @@ class DepthPrediction:
             depth (about the relative error), or None where the model does not say.
         is_sensor: True where the values were measured rather than predicted, so that
             their errors are independent from pixel to pixel and their scale is exact.
+        gravity: direction of gravity as for :class:`Frame` that the model went by, or None.
+        gravity_share: how sure the model is of it, 0 to 1; 1 where the frame told it.
     """
 
     values: NDArray[np.float32]
     kind: DepthKind
     sigma_log: NDArray[np.float32] | None = None
     is_sensor: bool = False
+    gravity: NDArray[np.float64] | None = None
+    gravity_share: float = 0.0
 
 
 @dataclass(frozen=True)

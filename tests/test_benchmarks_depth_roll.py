@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from made_up import MadeUpDataset
 
-from benchmarks.depth_roll import judged, main, predicted_upright, roll_rad, true_roll
+from benchmarks.depth_roll import judged, judged_knowing, main, predicted_upright, true_roll
+from slamdepth.depth.turning import roll_rad
 from slamdepth.geometry import se3_exp
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Trajectory
 
@@ -51,7 +52,7 @@ def ramp_as_taken(angle_rad: float) -> np.ndarray:
 @pytest.mark.parametrize("angle", [-1.0, 0.0, 0.4])
 @pytest.mark.parametrize("tilt", [0.0, -0.5])
 def test_the_roll_of_a_pose_is_that_of_down_in_the_image(angle: float, tilt: float) -> None:
-    assert roll_rad(rolled(angle, tilt), UP) == pytest.approx(angle, abs=1e-9)
+    assert roll_rad(rolled(angle, tilt)[:3, :3].T @ -UP) == pytest.approx(angle, abs=1e-9)
 
 
 @pytest.mark.parametrize("angle", [-0.6, 0.35])
@@ -108,6 +109,23 @@ def test_each_image_is_predicted_once_as_taken_and_once_upright() -> None:
     assert (of_taken > 0.08).all()
     assert (of_upright[[0, 1, 3]] < 0.03).all()  # what is left was cut off at the corners
     assert of_upright[2] == of_taken[2]
+
+
+class Knowing(FloorByRows):
+    """Believes that every image is upright, unless it is told."""
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        if frame.gravity is not None:
+            as_taken = super().predict(frame)
+            return predicted_upright(self, replace(frame, gravity=None), roll_rad(frame.gravity), as_taken)
+        found = None if frame.index == 3 else np.array([0.0, 1.0, 0.0])
+        return replace(super().predict(frame), gravity=found, gravity_share=1.0)
+
+
+def test_a_model_is_told_which_way_is_down_and_asked() -> None:
+    told, errors_deg = judged_knowing(RolledFloor(), Knowing(), UP, stride=1)
+    assert (np.array(told.per_frame["as_predicted.abs_rel"]) < 0.03).all()
+    np.testing.assert_allclose(errors_deg, [np.degrees(0.4)] * 2 + [180.0], atol=1e-6)
 
 
 def test_a_sequence_without_poses_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

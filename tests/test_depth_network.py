@@ -241,7 +241,10 @@ def test_levels_are_averaged_too_and_come_back_from_the_file(tmp_path: Path) -> 
     torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
 
 
-@pytest.mark.parametrize(("number", "without"), [(1, {"doubt", "level_dim"}), (2, {"level_dim"})])
+@pytest.mark.parametrize(
+    ("number", "without"),
+    [(1, {"doubt", "level_dim", "gravity"}), (2, {"level_dim", "gravity"}), (3, {"gravity"})],
+)
 def test_heads_of_earlier_formats_are_read(tmp_path: Path, number: int, without: set[str]) -> None:
     model = HeadEnsemble(SMALL)
     tensors = {name: value.half().contiguous() for name, value in model.state_dict().items()}

@@ -75,6 +75,7 @@ def test_image_and_depth_stay_together_through_the_lens(tmp_path: Path) -> None:
 def test_7scenes(tmp_path: Path) -> None:
     place = open_any(make_sevenscenes(tmp_path / "kitchen"))
     assert (len(place), place.benchmark) == (2, "7-Scenes sequences")
+    assert place.down(0) is None
     depth_m = place.read(0).depth_m
     assert depth_m is not None
     assert (depth_m[:10] == 0).all()
@@ -95,6 +96,7 @@ def test_synth_is_told_from_tum(tmp_path: Path) -> None:
 def test_hypersim(tmp_path: Path) -> None:
     place = open_any(make_hypersim(tmp_path / "ai_001_001"))
     assert (place.name, len(place), place.benchmark) == ("ai_001_001", 3, None)
+    assert place.down(0) is None
     assert place.camera.fx == pytest.approx(886.81 / 8)
     assert "1 of 4 frames have no image" in place.notes
     frame = place.read(2)  # of the second camera

@@ -20,15 +20,25 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from slamdepth.depth.doubt import Doubt
-from slamdepth.depth.head_layers import FACTOR, USUAL_DEPTH_M, Level, Residual, convex_upsample
+from slamdepth.depth.down import DownScorer
+from slamdepth.depth.gravity_field import CHANNELS
+from slamdepth.depth.head_layers import (
+    FACTOR,
+    USUAL_DEPTH_M,
+    Level,
+    Residual,
+    convex_upsample,
+    zeroed,
+)
 from slamdepth.depth.layout import check_layout, pack_about, unpack_about
 from slamdepth.errors import WeightsError
 
 UPSAMPLING = "weights."
 """Prefix of the parameters that only the upsampling to full resolution uses."""
-FORMAT = "slamdepth-depth-head-3"
-_READABLE = ("slamdepth-depth-head-1", "slamdepth-depth-head-2", FORMAT)
-"""The first format had no ``doubt``, the second no ``level_dim`` and no ``input_px``."""
+FORMAT = "slamdepth-depth-head-4"
+_READABLE = ("slamdepth-depth-head-1", "slamdepth-depth-head-2", "slamdepth-depth-head-3", FORMAT)
+"""The first format had no ``doubt``, the second no ``level_dim`` and no ``input_px``, the third no
+``gravity`` and no ``down_dim``."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +55,9 @@ class HeadShape:
         level_dim: channels of the branch that tells a view's mean log depth apart from its relief;
             0 where one branch tells both.
         input_px: rows times columns of the images it learnt from, and is given.
+        gravity: it is told where down is, by :func:`~slamdepth.depth.gravity_field.gravity_field`;
+            needs ``level_dim``.
+        down_dim: channels of the network that finds out which way is down; 0 where there is none.
     """
 
     taps: tuple[int, ...] = (5, 8, 11)
@@ -56,6 +69,8 @@ class HeadShape:
     doubt: int = 0
     level_dim: int = 0
     input_px: int = 238 * 322
+    gravity: bool = False
+    down_dim: int = 0
 
 
 class DepthHead(nn.Module):
@@ -63,15 +78,20 @@ class DepthHead(nn.Module):
 
     With ``level_dim`` relief and level are told apart: relief, of mean 0, by tokens less their mean
     over the view, so that it cannot know a place by what is common to its tokens; the level by those
-    means and the class tokens.
+    means and the class tokens. With ``gravity`` both are told how far below the horizon they look.
+
+    Raises:
+        ValueError: ``gravity`` without ``level_dim``.
     """
 
     def __init__(self, shape: HeadShape, dropout: float = 0.0) -> None:
         super().__init__()
+        if shape.gravity and not shape.level_dim:
+            raise ValueError("a head that is told where down is needs a level_dim above 0")
         width = len(shape.taps) * shape.token_dim
         self.drop = nn.Dropout2d(dropout)
         self.tokens = nn.Conv2d(width, shape.dim, 1)
-        self.level = Level(width, shape.level_dim) if shape.level_dim else None
+        self.level = Level(width, shape.level_dim, shape.gravity) if shape.level_dim else None
         self.class_tokens = None if shape.level_dim else nn.Linear(width, shape.dim)
         self.blocks = nn.ModuleList(Residual(shape.dim) for _ in range(shape.blocks))
         self.narrow = nn.Conv2d(shape.dim, shape.guide_dim, 1)
@@ -81,18 +101,30 @@ class DepthHead(nn.Module):
         self.weights = nn.Conv2d(shape.guide_dim, 9 * FACTOR * FACTOR, 1)
         nn.init.normal_(self.out.weight, std=1e-3)
         self.out.bias = nn.Parameter(torch.tensor([math.log(USUAL_DEPTH_M), math.log(0.3)]))
+        self.field = zeroed(nn.Conv2d(CHANNELS, shape.dim, 1)) if shape.gravity else None
 
-    def coarse(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Log depth and log spread ``(B, 2, H/7, W/7)``, and what the upsampling needs."""
+    def coarse(
+        self, tokens: Tensor, class_tokens: Tensor, image: Tensor, field: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Log depth and log spread ``(B, 2, H/7, W/7)``, and what the upsampling needs.
+
+        Args:
+            field: ``(B, 4, H/7, W/7)``, 0 where gravity is unknown; None where it is for all.
+        """
+        if field is None:
+            rows, columns = image.shape[2] // FACTOR, image.shape[3] // FACTOR
+            field = image.new_zeros(len(image), CHANNELS, rows, columns)
         x, cls = tokens.flatten(1, 2), class_tokens.flatten(1)
         level = None
         if self.level is not None:
             mean = x.mean(dim=(2, 3))
-            level = self.level(cls, mean)
+            level = self.level(cls, mean, field.mean(dim=(2, 3)))
             x = x - mean[..., None, None]
         x = self.tokens(self.drop(x))
         if self.class_tokens is not None:
             x = x + self.class_tokens(self.drop(cls[..., None, None])[..., 0, 0])[..., None, None]
+        if self.field is not None:
+            x = x + self.field(F.avg_pool2d(field, 2))
         x = F.gelu(x)
         for block in self.blocks:
             x = block(x)
@@ -104,14 +136,16 @@ class DepthHead(nn.Module):
             out = torch.cat([log_depth, out[:, 1:]], dim=1)
         return out, features
 
-    def forward(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> Tensor:
-        """Predict from ``tokens (B, taps, dim, H/14, W/14)``, ``class_tokens (B, taps, dim)``
-        and the ImageNet-normalised ``image (B, 3, H, W)``.
+    def forward(
+        self, tokens: Tensor, class_tokens: Tensor, image: Tensor, field: Tensor | None = None
+    ) -> Tensor:
+        """Predict from ``tokens (B, taps, dim, H/14, W/14)``, ``class_tokens (B, taps, dim)``,
+        the ImageNet-normalised ``image (B, 3, H, W)`` and the gravity ``field (B, 4, H/7, W/7)``.
 
         Returns:
             ``(B, 2, H, W)``: natural logarithm of the canonical depth, and of its Laplace spread.
         """
-        coarse, features = self.coarse(tokens, class_tokens, image)
+        coarse, features = self.coarse(tokens, class_tokens, image, field)
         return convex_upsample(coarse, self.weights(features))
 
 
@@ -133,11 +167,16 @@ class HeadEnsemble(nn.Module):
         self.sigma_scale = sigma_scale
         self.members = nn.ModuleList(DepthHead(shape) for _ in range(shape.members))
         self.doubt: Doubt | None = Doubt(shape.token_dim, shape.doubt) if shape.doubt else None
+        width = len(shape.taps) * shape.token_dim
+        self.down: DownScorer | None = DownScorer(width, shape.down_dim) if shape.down_dim else None
 
-    def forward(self, tokens: Tensor, class_tokens: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean log depth and its calibrated standard deviation, each ``(B, H, W)``."""
+    def forward(
+        self, tokens: Tensor, class_tokens: Tensor, image: Tensor, field: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Mean log depth and its calibrated standard deviation, each ``(B, H, W)``; see
+        :meth:`DepthHead.forward`."""
         members = cast("list[DepthHead]", list(self.members))
-        told = [member.coarse(tokens, class_tokens, image) for member in members]
+        told = [member.coarse(tokens, class_tokens, image, field) for member in members]
         if self.doubt is not None:
             log_depth = torch.stack([coarse[:, 0] for coarse, _ in told]).mean(dim=0)
             doubt = self.doubt(tokens[:, -1], log_depth)

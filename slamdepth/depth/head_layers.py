@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +17,7 @@ USUAL_DEPTH_M = 1.8
 """What an untrained head predicts, at the canonical focal length."""
 
 _LEVEL_DROPOUT = 0.5
+_Layer = TypeVar("_Layer", bound=nn.Module)
 
 
 class Residual(nn.Module):
@@ -34,19 +36,30 @@ class Residual(nn.Module):
 
 
 class Level(nn.Module):
-    """A view's mean log depth ``(B,)`` from its class tokens and mean tokens ``(B, width)`` each."""
+    """A view's mean log depth ``(B,)`` from its class tokens and mean tokens ``(B, width)`` each and,
+    with ``gravity``, the mean ``(B, 4)`` of its gravity field."""
 
-    def __init__(self, width: int, dim: int) -> None:
+    def __init__(self, width: int, dim: int, gravity: bool = False) -> None:
         super().__init__()
         self.drop = nn.Dropout(_LEVEL_DROPOUT)
         self.hidden = nn.Linear(2 * width, dim)
         self.out = nn.Linear(dim, 1)
         nn.init.zeros_(self.out.weight)
         nn.init.constant_(self.out.bias, math.log(USUAL_DEPTH_M))
+        self.gravity = zeroed(nn.Linear(4, dim)) if gravity else None
 
-    def forward(self, class_tokens: Tensor, mean_tokens: Tensor) -> Tensor:
-        seen = self.drop(torch.cat([class_tokens, mean_tokens], dim=1))
-        return self.out(F.gelu(self.hidden(seen)))[:, 0]
+    def forward(self, class_tokens: Tensor, mean_tokens: Tensor, mean_field: Tensor | None = None) -> Tensor:
+        hidden = self.hidden(self.drop(torch.cat([class_tokens, mean_tokens], dim=1)))
+        if self.gravity is not None and mean_field is not None:
+            hidden = hidden + self.gravity(mean_field)
+        return self.out(F.gelu(hidden))[:, 0]
+
+
+def zeroed(layer: _Layer) -> _Layer:
+    """``layer`` with all its parameters 0, so that it starts by adding nothing."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    return layer
 
 
 def convex_upsample(coarse: Tensor, logits: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from slamdepth.datasets.synth import SETTINGS_FILE
 from slamdepth.depth.training.data import PlaceReader, fingerprint
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.types import Camera, Frame
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 _BENCHMARKS = {"tum": "sequences in the TUM RGB-D layout", "7scenes": "7-Scenes sequences"}
 """What a head trained on a layout has seen; a recording of one's own in it counts too."""
@@ -85,6 +89,11 @@ class SequencePlace:
         if frame.depth_m is None:
             raise DatasetError(f"{self.dataset.path}: frame {self.frames[index]} has no depth")
         return replace(frame, index=index)
+
+    def down(self, index: int) -> NDArray[np.float64] | None:
+        """Unknown: nothing here says it."""
+        del index
+        return None
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,12 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from slamdepth.depth.base import DepthModel
 from slamdepth.tracker.threads import one_thread_here
+from slamdepth.tracker.world_gravity import WorldGravity
 from slamdepth.types import DepthPrediction, Frame
 
 
@@ -24,6 +28,7 @@ class DepthThread:
     def __init__(self, model: DepthModel, *, with_uncertainty: bool = True) -> None:
         self._model = model
         self._with_uncertainty = with_uncertainty
+        self._gravity = WorldGravity()
         self._pool = ThreadPoolExecutor(1, "slamdepth-depth", initializer=one_thread_here)
         self._asked: list[tuple[Frame, Future[DepthPrediction]]] = []
         self._taken: tuple[Frame, DepthPrediction] | None = None
@@ -39,13 +44,23 @@ class DepthThread:
     def _is_taken(self, frame: Frame) -> bool:
         return self._taken is not None and self._taken[0] is frame
 
-    def ask(self, frame: Frame) -> None:
-        """Start the prediction for ``frame``, after those asked for before; nothing where it was."""
-        if not self._is_taken(frame) and all(asked is not frame for asked, _ in self._asked):
-            self._asked.append((frame, self._pool.submit(self._predict, frame)))
+    def ask(self, frame: Frame, R_world_camera: NDArray[np.float64] | None = None) -> None:
+        """Start the prediction for ``frame``, after those asked for before; nothing where it was.
 
-    def _predict(self, frame: Frame) -> DepthPrediction:
-        prediction = self._model.predict(frame)
+        Args:
+            R_world_camera: ``(3, 3)``, where it is known: what one frame tells of gravity helps the next.
+        """
+        if not self._is_taken(frame) and all(asked is not frame for asked, _ in self._asked):
+            self._asked.append((frame, self._pool.submit(self._predict, frame, R_world_camera)))
+
+    def _predict(self, frame: Frame, R_world_camera: NDArray[np.float64] | None) -> DepthPrediction:
+        if R_world_camera is None or frame.gravity is not None:
+            prediction = self._model.predict(frame)
+        else:
+            known = self._gravity.in_camera(R_world_camera)
+            prediction = self._model.predict(replace(frame, gravity=known))
+            if known is None and prediction.gravity is not None:
+                self._gravity.add(R_world_camera, prediction.gravity, prediction.gravity_share)
         if self._with_uncertainty or prediction.is_sensor:
             return prediction
         return replace(prediction, sigma_log=None)

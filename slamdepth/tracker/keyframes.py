@@ -144,7 +144,7 @@ class Keyframes:
 
     def make(self, frame: Frame, features: Features, placement: Placement, velocity: Floats) -> MapKeyframe:
         """Put a frame into the map; its depth follows ``tracking.depth_delay`` frames later."""
-        self._depth.ask(frame)
+        self._depth.ask(frame, placement.T_camera_world[:3, :3].T)
         with self._timed("mapping"):
             keyframe = self._mapper.insert(
                 frame, features, placement.T_camera_world, placement.point_ids, velocity

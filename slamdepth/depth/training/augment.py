@@ -8,13 +8,14 @@ held-rolled cameras, other focal lengths, other distances, other light.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slamdepth.depth.training.config import AugmentConfig
 from slamdepth.depth.training.lens import raw_pixels
+from slamdepth.depth.turning import roll_rad
 from slamdepth.geometry import so3_exp
 from slamdepth.types import Frame
 
@@ -30,17 +31,29 @@ class View:
         image_rgb: ``(rows, columns, 3)`` uint8.
         depth_m: ``(rows, columns)`` float32, 0 where unknown.
         focal_px: focal length in pixels of ``image_rgb``.
+        down: ``(3,)`` unit direction of gravity in the view's camera frame; zeros where unknown.
     """
 
     image_rgb: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     focal_px: float
+    down: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
 
 def augmented_view(
-    frame: Frame, rows: int, columns: int, config: AugmentConfig, rng: np.random.Generator
+    frame: Frame,
+    rows: int,
+    columns: int,
+    config: AugmentConfig,
+    rng: np.random.Generator,
+    down: NDArray[np.float64] | None = None,
 ) -> View:
-    """A random view of ``frame`` (which has depth) at ``rows`` x ``columns`` pixels."""
+    """A random view of ``frame`` (which has depth) at ``rows`` x ``columns`` pixels.
+
+    Args:
+        down: ``(3,)`` unit direction of gravity in the frame's camera. The view is then turned about
+            upright, not about how the camera was held.
+    """
     flip = rng.random() < config.flip
     rolled = rng.random() < config.rolled
     roll = (
@@ -48,17 +61,79 @@ def augmented_view(
         if rolled
         else rng.normal(0.0, config.upright_roll_deg)
     )
+    if down is not None:
+        roll -= float(np.degrees(roll_rad(down)))
     tilt = rng.uniform(-config.max_tilt_deg, config.max_tilt_deg, 2)
+    zoom = _zoom(config, roll, rng)
+    R_camera_view = _turn(roll, tilt[0], tilt[1])
+    image, depth, focal = seen_from(frame, rows, columns, R_camera_view, zoom, flip)
+    return View(photometric(image, config, rng), depth, focal, _down_in_view(down, R_camera_view, flip))
+
+
+def plain_view(frame: Frame, rows: int, columns: int, down: NDArray[np.float64] | None = None) -> View:
+    """``frame`` seen by its own camera with square pixels, centred, at ``rows`` x ``columns``; rolled
+    upright where ``down (3,)``, the direction of gravity in its frame, is known."""
+    R_camera_view = _turn(0.0 if down is None else -float(np.degrees(roll_rad(down))), 0.0, 0.0)
+    seen = seen_from(frame, rows, columns, R_camera_view, 1.0, False)
+    return View(*seen, _down_in_view(down, R_camera_view, False))
+
+
+def matching_view(
+    frame: Frame,
+    rows: int,
+    columns: int,
+    config: AugmentConfig,
+    rng: np.random.Generator,
+    down: NDArray[np.float64],
+    wanted: NDArray[np.float64],
+) -> View:
+    """A random view of ``frame`` in which gravity points as ``wanted``, so that both can be one scene.
+
+    Args:
+        down: ``(3,)`` unit direction of gravity in the frame's camera.
+        wanted: ``(3,)`` that in the view. Their angles below the horizon should differ little.
+    """
+    flip = rng.random() < config.flip
+    unflipped = wanted * [-1.0, 1.0, 1.0] if flip else wanted
+    about_down = so3_exp(unflipped * np.radians(rng.uniform(-config.max_tilt_deg, config.max_tilt_deg)))
+    R_camera_view = _taking(unflipped, down) @ about_down
+    roll = float(np.degrees(np.arctan2(R_camera_view[1, 0], R_camera_view[0, 0])))
+    zoom = _zoom(config, roll, rng)
+    image, depth, focal = seen_from(frame, rows, columns, R_camera_view, zoom, flip)
+    return View(photometric(image, config, rng), depth, focal, wanted)
+
+
+def _zoom(config: AugmentConfig, roll_deg: float, rng: np.random.Generator) -> float:
     # A rolled view without zoom would show more of the mirrored border than of the scene.
-    least = 1.0 + 0.25 * abs(np.sin(np.radians(roll)))
-    zoom = float(np.exp(rng.uniform(np.log(least), np.log(max(config.max_zoom, least)))))
-    image, depth, focal = turned_view(frame, rows, columns, roll, tilt[0], tilt[1], zoom, flip)
-    return View(photometric(image, config, rng), depth, focal)
+    least = 1.0 + 0.25 * abs(np.sin(np.radians(roll_deg)))
+    return float(np.exp(rng.uniform(np.log(least), np.log(max(config.max_zoom, least)))))
 
 
-def plain_view(frame: Frame, rows: int, columns: int) -> View:
-    """``frame`` seen by its own camera with square pixels, centred, at ``rows`` x ``columns``."""
-    return View(*turned_view(frame, rows, columns, 0.0, 0.0, 0.0, 1.0, False))
+def _turn(roll_deg: float, pan_deg: float, tilt_deg: float) -> NDArray[np.float64]:
+    """``R_camera_view (3, 3)``."""
+    return so3_exp(np.radians([0.0, 0.0, roll_deg])) @ so3_exp(np.radians([tilt_deg, pan_deg, 0.0]))
+
+
+def _taking(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation ``(3, 3)`` that takes one unit vector to the other: a roll about the optical axis, then
+    the pitch that is left, so that the axis moves no more than it has to."""
+    roll = np.arctan2(target[1], target[0]) - np.arctan2(source[1], source[0])
+    R_roll = so3_exp(np.array([0.0, 0.0, roll]))
+    rolled = R_roll @ source
+    axis = np.cross(rolled, target)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        return R_roll
+    return so3_exp(axis / sine * np.arctan2(sine, rolled @ target)) @ R_roll
+
+
+def _down_in_view(
+    down: NDArray[np.float64] | None, R_camera_view: NDArray[np.float64], flip: bool
+) -> NDArray[np.float64]:
+    if down is None:
+        return np.zeros(3)
+    seen = R_camera_view.T @ down
+    return seen * [-1.0, 1.0, 1.0] if flip else seen
 
 
 def mixed_view(first: View, second: View) -> View:
@@ -76,6 +151,7 @@ def mixed_view(first: View, second: View) -> View:
         np.where(in_front[..., None], first.image_rgb, second.image_rgb),
         np.where(in_front, first.depth_m, second_m),
         first.focal_px,
+        first.down,
     )
 
 
@@ -106,8 +182,16 @@ def turned_view(
     zoom: float,
     flip: bool,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], float]:
+    """Image, depth and focal length (px) of ``frame``, see :func:`seen_from`, turned by angles."""
+    return seen_from(frame, rows, columns, _turn(roll_deg, pan_deg, tilt_deg), zoom, flip)
+
+
+def seen_from(
+    frame: Frame, rows: int, columns: int, R_camera_view: NDArray[np.float64], zoom: float, flip: bool
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], float]:
     """Image, depth and focal length (px) of ``frame`` after an exact camera rotation.
 
+    ``R_camera_view (3, 3)`` takes directions of the view, before it is mirrored, to the frame's.
     The view is that of a pinhole: lens distortion of ``frame.camera`` is undone.
     Pixels from outside the frame mirror its border and have depth 0.
     """
@@ -120,7 +204,6 @@ def turned_view(
     if flip:
         K_view = np.diag([-1.0, 1.0, 1.0]) @ K_view
         K_view[0, 2] += columns - 1
-    R_camera_view = so3_exp(np.radians([0.0, 0.0, roll_deg])) @ so3_exp(np.radians([tilt_deg, pan_deg, 0.0]))
     u, v = np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64))
     rays_view = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K_view).T
     rays = rays_view @ R_camera_view.T

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
-from slamdepth.depth.training.config import TrainConfig, ViewConfig, digest
+from slamdepth.depth.training.config import Teaches, TrainConfig, ViewConfig, digest
 from slamdepth.depth.training.data import Place, PlaceReader, data_folder, open_place
 from slamdepth.depth.training.features import FeatureCache, build_cache
 from slamdepth.depth.training.progress import Progress, silent
@@ -19,7 +19,7 @@ from slamdepth.errors import ConfigError
 
 _JUDGED_VIEWS = 50
 _T = TypeVar("_T")
-_VIEW_VERSION = 3
+_VIEW_VERSION = 4
 """Counts up where the same settings make other views or features."""
 
 
@@ -34,6 +34,7 @@ class PlannedCache:
         members: heads that learn from it; None where all do.
         partners: what is mixed into them: all places that are trained on.
         held_out: name of the place where it is for judging, else None.
+        teaches: what is learnt from it.
     """
 
     folder: Path
@@ -43,6 +44,7 @@ class PlannedCache:
     held_out: str | None = None
     partners: tuple[Partner, ...] = ()
     members: tuple[int, ...] | None = None
+    teaches: Teaches = "both"
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,8 @@ def plan_caches(
     if trained & judged:
         raise ConfigError(f"setting 'sources': {min(trained & judged).name} is held out and also trained on")
     for member in range(config.members):
-        if not any(source.places and _teaches(source.members, member) for source in config.sources):
+        teachers = [source for source in config.sources if source.places and source.teaches != "down"]
+        if not any(_teaches(source.members, member) for source in teachers):
             raise ConfigError(f"setting 'sources': there is no place to train on for member {member}")
 
     def where(view: ViewConfig, places: tuple[Place, ...], *more: object) -> Path:
@@ -121,11 +124,13 @@ def plan_caches(
                 tuple(keys),
                 view,
                 members=source.members,
+                teaches=source.teaches,
             )
         )
     partners = tuple(
         Partner(place, cache.view.augment, sum(key.place == index for key in cache.keys))
         for cache in planned
+        if cache.teaches != "down"
         for index, place in enumerate(cache.places)
     )
     mixing = [(p.place.fingerprint, p.augment.model_dump_json(), p.weight) for p in partners]
@@ -159,7 +164,17 @@ def of_member(planned: Sequence[PlannedCache], each: Sequence[_T], member: int) 
     return [
         one
         for plan, one in zip(planned, each, strict=True)
-        if plan.held_out is None and _teaches(plan.members, member)
+        if plan.held_out is None and plan.teaches != "down" and _teaches(plan.members, member)
+    ]
+
+
+def of_gravity(planned: Sequence[PlannedCache], each: Sequence[_T]) -> list[_T]:
+    """The same of what the network learns from that finds out which way is down: views as they were
+    taken but for how they are turned."""
+    return [
+        one
+        for plan, one in zip(planned, each, strict=True)
+        if plan.held_out is None and plan.view.upright and not plan.view.augment.mixed
     ]
 
 
@@ -173,10 +188,11 @@ def fill_cache(
     stage: str = "features",
 ) -> FeatureCache:
     """Compute what is missing of ``planned``; errors of :func:`build_cache`."""
-    return build_cache(
+    cache = build_cache(
         planned.folder, planned.places, planned.keys, planned.view, backbone, config.head.taps, config.seed,
         device=device, partners=planned.partners, progress=progress, stage=stage,
     )  # fmt: skip
+    return replace(cache, teaches=planned.teaches)
 
 
 def benchmarks_seen(planned: list[PlannedCache]) -> dict[str, tuple[str, ...]]:

@@ -21,6 +21,10 @@ from pydantic import (
 
 from slamdepth.errors import ConfigError
 
+Teaches = Literal["relief", "level", "both", "down"]
+"""What is learnt from views: the relief of each, its mean log depth (so its scale), both, or none of it
+but which way is down."""
+
 
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -67,6 +71,9 @@ class SourceConfig(_Section):
         "different things are worth more together than heads that differ by seed",
     )
     augment: AugmentConfig | None = Field(None, description="of this source's views; view.augment if absent")
+    teaches: Teaches = Field(
+        "both", description="what is learnt from it: mixed views, say, show no true scale"
+    )
     held_out: tuple[str, ...] = Field((), description="places judged on after training, never trained on")
     limit: int | None = Field(
         None, ge=1, description="only so many of the samples, a random choice; leaves the others' views alone"
@@ -81,6 +88,11 @@ class ViewConfig(_Section):
     min_depth_m: float = Field(0.2, gt=0)
     max_depth_m: float = Field(10.0, gt=0)
     augment: AugmentConfig = AugmentConfig()
+    upright: bool = Field(
+        False,
+        description="views are turned upright by their gravity, which a place's gravity.txt or lines in "
+        "the image tell",
+    )
 
 
 class HeadConfig(_Section):
@@ -95,6 +107,20 @@ class HeadConfig(_Section):
         0, ge=0, le=256, description="channels of a branch that tells a view's scale apart from its relief; "
         "0: both are told by the same layers",
     )  # fmt: skip
+    gravity: bool = Field(False, description="the head is told where down is")
+    unknown_gravity: float = Field(
+        0.1, ge=0, le=1, description="share of training samples for which the head is not told"
+    )
+    down_dim: int = Field(
+        0, ge=0, le=256, description="channels of a network that finds out which way is down; 0: there is "
+        "none, and the head is never told",
+    )  # fmt: skip
+
+    @model_validator(mode="after")
+    def _gravity_has_its_branch(self) -> HeadConfig:
+        if self.gravity and not self.level_dim:
+            raise ValueError("gravity needs a level_dim above 0")
+        return self
 
 
 class LossConfig(_Section):
@@ -160,6 +186,14 @@ class TrainConfig(_Section):
         {}, description="settings that --search tunes, by their dotted name, such as head.dim"
     )
 
+    @field_validator("head")
+    @classmethod
+    def _knows_gravity(cls, head: HeadConfig, info: ValidationInfo) -> HeadConfig:
+        view = info.data.get("view")
+        if (head.gravity or head.down_dim) and view is not None and not view.upright:
+            raise ValueError("gravity and down_dim need 'view: {upright: true}', which finds gravity out")
+        return head
+
     @field_validator("search")
     @classmethod
     def _are_searchable(cls, search: dict[str, SearchRange]) -> dict[str, SearchRange]:
@@ -223,7 +257,7 @@ def _numbers(section: type[BaseModel], prefix: str = "", left_out: tuple[str, ..
 # What decides on the features, the places or the size of the file is not for a search.
 SEARCHABLE: dict[str, bool] = {
     **_numbers(TrainConfig, left_out=("seed", "members", "sigma_scale")),
-    **_numbers(HeadConfig, "head."),
+    **_numbers(HeadConfig, "head.", left_out=("down_dim",)),
     **_numbers(LossConfig, "loss."),
 }
 """Settings that can be searched, by dotted name; True where they are whole numbers."""

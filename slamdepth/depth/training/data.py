@@ -15,10 +15,14 @@ import os
 import pkgutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from slamdepth.errors import DatasetError
 from slamdepth.types import Camera, Frame
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 logger = logging.getLogger(__name__)
 
@@ -53,6 +57,11 @@ class Place(Protocol):
         Raises:
             DatasetError: a file does not decode or has another size than the camera's.
         """
+        ...
+
+    def down(self, index: int) -> NDArray[np.float64] | None:
+        """Unit direction of gravity ``(3,)`` in the camera's frame of image ``index``; None where the
+        place does not say."""
         ...
 
 

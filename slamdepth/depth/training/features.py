@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth.depth.gravity_field import gravity_field
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, normalised
-from slamdepth.depth.training.config import ViewConfig
+from slamdepth.depth.training.config import Teaches, ViewConfig
 from slamdepth.depth.training.data import Place
 from slamdepth.depth.training.progress import Progress, TrainStep, silent
 from slamdepth.depth.training.store import SampleStore, Spec, locked
@@ -42,7 +43,9 @@ class FeatureCache:
         canonical_m: ``(N, rows, columns)`` float16, depth at the canonical focal
             length, 0 unknown.
         focal_factor: ``(N,)`` float32; metres per canonical metre.
+        down: ``(N, 3)`` float32, unit direction of gravity in the view's camera frame; zeros unknown.
         place: ``(N,)`` int, index into the places.
+        teaches: what is learnt from them.
     """
 
     tokens: NDArray[np.float16]
@@ -50,7 +53,9 @@ class FeatureCache:
     image_rgb: NDArray[np.uint8]
     canonical_m: NDArray[np.float16]
     focal_factor: NDArray[np.float32]
+    down: NDArray[np.float32]
     place: NDArray[np.int64]
+    teaches: Teaches = "both"
 
     def __len__(self) -> int:
         return len(self.place)
@@ -65,6 +70,7 @@ def sample_specs(config: ViewConfig, taps: tuple[int, ...], dim: int, patch: int
         "image_rgb": ((rows, columns, 3), np.uint8),
         "canonical_m": ((rows, columns), np.float16),
         "focal_factor": ((), np.float32),
+        "down": ((3,), np.float32),
     }
 
 
@@ -107,6 +113,7 @@ def build_cache(
                 image_rgb=np.stack([view.image_rgb for view in views]),
                 canonical_m=np.stack([canonical_depth(view, config) for view in views]),
                 focal_factor=[view.focal_px / CANONICAL_FOCAL_PX for view in views],
+                down=np.stack([view.down for view in views]),
             )
             progress(TrainStep(stage, count, len(groups)))
         store.commit()
@@ -114,7 +121,7 @@ def build_cache(
     place = np.array([key.place for key in keys], dtype=np.int64)
     return FeatureCache(
         arrays["tokens"], arrays["class_tokens"], arrays["image_rgb"], arrays["canonical_m"],
-        np.asarray(arrays["focal_factor"]), place,
+        np.asarray(arrays["focal_factor"]), np.asarray(arrays["down"]), place,
     )  # fmt: skip
 
 
@@ -134,13 +141,34 @@ def encode(
 
 def load_batch(
     cache: FeatureCache, chosen: NDArray[np.int64], device: str
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Tokens, class tokens, normalised images and canonical depth of the samples ``chosen (B,)``."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Tokens, class tokens, normalised images, gravity fields and canonical depth of the samples
+    ``chosen (B,)``."""
     import torch
 
+    rows, columns = cache.canonical_m.shape[1:]
+    focal_px = torch.from_numpy(cache.focal_factor[chosen] * np.float32(CANONICAL_FOCAL_PX))
     return (
         torch.from_numpy(cache.tokens[chosen]).to(device).float(),
         torch.from_numpy(cache.class_tokens[chosen]).to(device).float(),
         normalised(cache.image_rgb[chosen], device),
+        gravity_field(torch.from_numpy(cache.down[chosen]), focal_px, rows, columns).to(device),
         torch.from_numpy(cache.canonical_m[chosen]).to(device).float(),
     )
+
+
+def load_mixed_batch(
+    caches: Sequence[FeatureCache], chosen: NDArray[np.int64], device: str
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]:
+    """The samples ``chosen (B, 2)``, each a cache and a sample of it, as :func:`load_batch` gives them,
+    sorted by cache; and ``(B, 2)`` whether each teaches relief, and level."""
+    import torch
+
+    present = np.unique(chosen[:, 0])
+    each = [np.sort(chosen[chosen[:, 0] == c, 1]) for c in present]
+    parts = [load_batch(caches[c], some, device) for c, some in zip(present, each, strict=True)]
+    taught = [[caches[c].teaches in (one, "both") for one in ("relief", "level")] for c in present]
+    repeats = torch.tensor([len(some) for some in each])
+    teaches = torch.tensor(taught, dtype=torch.float32).repeat_interleave(repeats, dim=0)
+    tokens, class_tokens, image, field, depth = (torch.cat(part) for part in zip(*parts, strict=True))
+    return (tokens, class_tokens, image, field, depth), teaches.to(device)

@@ -37,11 +37,11 @@ def judge(
     for k in range(len(cache)):
         batch = load_batch(cache, np.array([k]), device)
         with torch.inference_mode():
-            log_depth, sigma = ensemble(*batch[:3])
-        known = batch[3][0] > 0
+            log_depth, sigma = ensemble(*batch[:4])
+        known = batch[4][0] > 0
         if int(known.sum()) < _FEWEST_PIXELS:
             continue
-        error = (log_depth[0][known] - batch[3][0][known].log()).double().cpu().numpy()
+        error = (log_depth[0][known] - batch[4][0][known].log()).double().cpu().numpy()
         ratios.append(np.abs(error) / sigma[0][known].double().cpu().numpy())
         median = float(np.median(error))
         scaled = np.exp(error - median)
@@ -131,7 +131,7 @@ def _sample_view(
 ) -> SampleView:
     batch = load_batch(cache, np.array([k]), device)
     with torch.inference_mode():
-        log_depth, sigma = ensemble(*batch[:3])
+        log_depth, sigma = ensemble(*batch[:4])
     factor = float(cache.focal_factor[k])
     return SampleView(
         planned.places[int(cache.place[k])].name,

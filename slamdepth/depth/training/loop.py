@@ -28,6 +28,7 @@ from slamdepth.depth.training.caches import (
     PlannedCache,
     benchmarks_seen,
     fill_cache,
+    of_gravity,
     of_member,
     open_encoder,
     plan_caches,
@@ -41,13 +42,14 @@ from slamdepth.depth.training.checkpoint import (
 )
 from slamdepth.depth.training.config import TrainConfig, digest
 from slamdepth.depth.training.data import PlaceReader
-from slamdepth.depth.training.features import FeatureCache, load_batch
+from slamdepth.depth.training.down import learn_down
+from slamdepth.depth.training.features import FeatureCache, load_mixed_batch
 from slamdepth.depth.training.judge import held_out_figures, judge, sample_views
-from slamdepth.depth.training.losses import total_loss
+from slamdepth.depth.training.losses import taught, total_loss
 from slamdepth.depth.training.out_of_fold import COMPONENTS, learn_doubt, plan_folds
 from slamdepth.depth.training.progress import Progress, TrainStep, silent
 from slamdepth.depth.training.results import EpochFigures, TrainResult
-from slamdepth.depth.training.stages import FINE_COST, predict
+from slamdepth.depth.training.stages import FINE_COST, not_always_told, predict
 from slamdepth.errors import OutputError
 
 logger = logging.getLogger(__name__)
@@ -109,6 +111,9 @@ def train_depth(
         head, epochs = _train_member(config, training, judging, shape, member, key, device, progress)
         ensemble.members[member].load_state_dict(head.state_dict())
         history += epochs
+    if ensemble.down is not None:
+        scorer = learn_down(of_gravity(planned, caches), shape, config.seed, device, progress)
+        ensemble.down.load_state_dict(scorer.state_dict())
     unseen: dict[str, dict[str, float]] = {}
     ensemble.sigma_scale = config.sigma_scale
     if folds:
@@ -167,6 +172,8 @@ def head_shape(config: TrainConfig, token_dim: int, *, doubt: int = 0) -> HeadSh
         doubt=doubt,
         level_dim=config.head.level_dim,
         input_px=config.view.rows * config.view.columns,
+        gravity=config.head.gravity,
+        down_dim=config.head.down_dim,
     )
 
 
@@ -253,14 +260,11 @@ def _epoch(
     total = 0.0
     for step in range(steps):
         chosen = samples[np.sort(order[step * config.batch : (step + 1) * config.batch])]
-        parts = [
-            load_batch(cache, chosen[chosen[:, 0] == c, 1], device)
-            for c, cache in enumerate(caches)
-            if (chosen[:, 0] == c).any()
-        ]
-        tokens, class_tokens, image, target = (torch.cat(part) for part in zip(*parts, strict=True))
-        batch = (tokens, class_tokens, image, target)
-        loss = total_loss(*predict(head, batch, is_fine), config.loss)
+        batch, teaches = load_mixed_batch(caches, chosen, device)
+        if config.head.gravity:
+            batch = not_always_told(batch, config.head.unknown_gravity)
+        prediction, target = predict(head, batch, is_fine)
+        loss = total_loss(taught(prediction, target, teaches), target, config.loss)
         for group in optimiser.param_groups:
             group["lr"] = learning_rate(config, epoch + step / steps)
         optimiser.zero_grad()

@@ -50,7 +50,11 @@ def plan_folds(planned: Sequence[PlannedCache]) -> list[Fold]:
     Raises:
         ConfigError: no source would be left to learn from.
     """
-    plain = [k for k, plan in enumerate(planned) if plan.held_out is None and not plan.view.augment.mixed]
+    plain = [
+        k
+        for k, plan in enumerate(planned)
+        if plan.held_out is None and plan.teaches != "down" and not plan.view.augment.mixed
+    ]
     places = [{place.fingerprint for place in plan.places} for plan in planned]
     folds = []
     for left_out in plain:
@@ -101,9 +105,9 @@ def errors_of(head: DepthHead, cache: FeatureCache, seed: Sequence[int], device:
     parts: list[tuple[Tensor, ...]] = []
     for start in range(0, len(cache), _VIEWS_AT_ONCE):
         chosen = np.arange(start, min(start + _VIEWS_AT_ONCE, len(cache)))
-        tokens, class_tokens, image, depth = load_batch(cache, chosen, device)
+        tokens, class_tokens, image, field, depth = load_batch(cache, chosen, device)
         with torch.inference_mode():
-            log_depth, own = head.coarse(tokens, class_tokens, image)[0].cpu().unbind(dim=1)
+            log_depth, own = head.coarse(tokens, class_tokens, image, field)[0].cpu().unbind(dim=1)
         target, last, shapes = coarse_target(depth).cpu(), tokens[:, -1].cpu(), relief(log_depth)
         for k, view in enumerate(chosen):
             known = torch.nonzero(target[k] > 0)

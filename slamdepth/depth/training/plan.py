@@ -13,7 +13,9 @@ import torch
 
 from slamdepth.depth.checkpoints import check_device
 from slamdepth.depth.dinov2 import DinoV2
+from slamdepth.depth.gravity_field import CHANNELS
 from slamdepth.depth.head import DepthHead, HeadShape
+from slamdepth.depth.head_layers import FACTOR
 from slamdepth.depth.preprocess import PATCH
 from slamdepth.depth.training.caches import Encoder, benchmarks_seen, of_member, open_encoder, plan_caches
 from slamdepth.depth.training.config import TrainConfig
@@ -134,6 +136,7 @@ def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[flo
         torch.zeros(config.batch, len(taps), dim, view.rows // patch, view.columns // patch, device=device),
         torch.zeros(config.batch, len(taps), dim, device=device),
         torch.zeros(config.batch, 3, view.rows, view.columns, device=device),
+        torch.zeros(config.batch, CHANNELS, view.rows // FACTOR, view.columns // FACTOR, device=device),
         torch.ones(config.batch, view.rows, view.columns, device=device),
     )
 

@@ -12,17 +12,24 @@ from slamdepth.depth.head_layers import FACTOR
 FINE_COST = 5
 """A step at full resolution costs about so many at 1/7."""
 
-Batch = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Tokens, class tokens, normalised images and canonical depth; see :func:`load_batch`."""
+Batch = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Tokens, class tokens, normalised images, gravity fields and canonical depth; see :func:`load_batch`."""
 
 
 def predict(head: DepthHead, batch: Batch, is_fine: bool) -> tuple[Tensor, Tensor]:
     """Log depth and log spread ``(B, 2, h, w)`` and the depth ``(B, h, w)`` to judge them by, both
     at full resolution or at 1/7."""
-    tokens, class_tokens, image, target = batch
+    tokens, class_tokens, image, field, target = batch
     if is_fine:
-        return head(tokens, class_tokens, image), target
-    return head.coarse(tokens, class_tokens, image)[0], coarse_target(target)
+        return head(tokens, class_tokens, image, field), target
+    return head.coarse(tokens, class_tokens, image, field)[0], coarse_target(target)
+
+
+def not_always_told(batch: Batch, share: float) -> Batch:
+    """``batch`` with the gravity fields of a random ``share`` of its samples zeroed: unknown."""
+    tokens, class_tokens, image, field, target = batch
+    is_told = (torch.rand(len(field), 1, 1, 1) >= share).to(field)
+    return tokens, class_tokens, image, field * is_told, target
 
 
 def coarse_target(target: Tensor) -> Tensor:

@@ -11,12 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
-from slamdepth.depth.training.augment import View, augmented_view, mixed_view, plain_view
+from slamdepth.depth.training.augment import View, augmented_view, matching_view, mixed_view, plain_view
 from slamdepth.depth.training.config import AugmentConfig, ViewConfig
 from slamdepth.depth.training.data import Place
+from slamdepth.depth.training.gravity import down_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+_PITCH_APART_DEG = 16.0
+_TRIES = 40
 
 
 @dataclass(frozen=True)
@@ -72,28 +76,50 @@ def make_view(
 ) -> View:
     """The view ``key`` names; the same for the same seed whatever else is made.
 
+    With ``config.upright`` it is turned by its gravity, where that is known, and what is mixed into it
+    shares its gravity.
+
     Args:
         partners: what is mixed into it, as often as ``config.augment.mixed`` says.
     """
     place = places[key.place]
+    frame = place.read(key.frame)
+    down = down_of(place, key.frame, frame) if config.upright else None
     if key.copy < 0:
-        return plain_view(place.read(key.frame), config.rows, config.columns)
+        return plain_view(frame, config.rows, config.columns, down)
     rng = np.random.default_rng([seed, zlib.crc32(place.name.encode()), key.frame, key.copy])
 
-    def view_of(place: Place, frame: int, augment: AugmentConfig) -> View:
-        return augmented_view(place.read(frame), config.rows, config.columns, augment, rng)
-
-    def another() -> View:
+    def drawn() -> tuple[Partner, int]:
         weights = np.array([partner.weight for partner in partners])
         chosen = partners[rng.choice(len(partners), p=weights / weights.sum())]
-        return view_of(chosen.place, int(rng.integers(len(chosen.place))), chosen.augment)
+        return chosen, int(rng.integers(len(chosen.place)))
 
-    view = view_of(place, key.frame, config.augment)
+    size = config.rows, config.columns
+
+    def with_another(view: View) -> View:
+        if down is None:
+            partner, index = drawn()
+            return mixed_view(view, augmented_view(partner.place.read(index), *size, partner.augment, rng))
+        for _ in range(_TRIES):
+            partner, index = drawn()
+            own = down_of(partner.place, index)
+            if own is not None and abs(_pitch_deg(own) - _pitch_deg(view.down)) < _PITCH_APART_DEG:
+                frame = partner.place.read(index)
+                other = matching_view(frame, *size, partner.augment, rng, own, view.down)
+                return mixed_view(view, other)
+        return view
+
+    view = augmented_view(frame, config.rows, config.columns, config.augment, rng, down)
     if partners and rng.random() < config.augment.mixed:
-        view = mixed_view(view, another())
+        view = with_another(view)
         if rng.random() < config.augment.mixed_again:
-            view = mixed_view(view, another())
+            view = with_another(view)
     return view
+
+
+def _pitch_deg(down: NDArray[np.float64]) -> float:
+    """How far a camera in whose frame gravity points along ``down (3,)`` looks below the horizon."""
+    return float(np.degrees(np.arcsin(np.clip(down[2], -1.0, 1.0))))
 
 
 def canonical_depth(view: View, config: ViewConfig) -> NDArray[np.float32]:

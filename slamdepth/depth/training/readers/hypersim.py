@@ -63,6 +63,11 @@ class HypersimPlace:
                 raise DatasetError(f"{path}: {shape[:2]} pixels, the scene's first image has {expected}")
         return Frame(index, float(index), image_rgb, self.camera, planar_depth_m(distance_m, self.camera))
 
+    def down(self, index: int) -> NDArray[np.float64] | None:
+        """Unknown: nothing here says it."""
+        del index
+        return None
+
 
 @register_reader
 class HypersimReader:

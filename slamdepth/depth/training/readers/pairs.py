@@ -2,7 +2,9 @@
 """Training pairs: a folder a place, with ``camera.json`` and ``NNNNN.jpg`` + ``NNNNN.png`` files.
 
 ``camera.json`` has ``width height fx fy cx cy`` in pixels and, where the depth is not in
-millimetres, ``depth_unit_m``: metres per unit of the 16-bit depth images.
+millimetres, ``depth_unit_m``: metres per unit of the 16-bit depth images. ``gravity.txt`` may say where
+down is: lines ``NNNNN x y z``, the pair's name and the unit direction of gravity in the camera's frame
+(x right, y down, z forward).
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +21,13 @@ from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import read_depth_raw, read_image_rgb
 from slamdepth.types import Camera, Frame
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+GRAVITY_FILE = "gravity.txt"
 _IMAGE_ENDINGS = (".jpg", ".jpeg")
+_UNIT_TOLERANCE = 0.01
+_Direction = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -28,6 +37,7 @@ class PairPlace:
     Attributes:
         images, depths: file paths, in the same order.
         depth_unit_m: metres per unit of the depth files.
+        downs: unit direction of gravity in the camera's frame, of each pair; empty where none is known.
     """
 
     name: str
@@ -37,13 +47,15 @@ class PairPlace:
     depth_unit_m: float
     notes: tuple[str, ...] = ()
     benchmark: str | None = None
+    downs: tuple[_Direction | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.images)
 
     @property
     def fingerprint(self) -> str:
-        return fingerprint((*self.images, *self.depths), self.camera, self.depth_unit_m)
+        told = (self.downs,) if self.downs else ()
+        return fingerprint((*self.images, *self.depths), self.camera, self.depth_unit_m, *told)
 
     def read(self, index: int) -> Frame:
         """The pair ``index``; see :meth:`slamdepth.depth.training.data.Place.read`."""
@@ -57,6 +69,11 @@ class PairPlace:
                 raise DatasetError(f"{path}: {array.shape[:2]} pixels, camera.json says {expected}")
         depth_m = (raw.astype(np.float32) * self.depth_unit_m).astype(np.float32)
         return Frame(index, float(index), image_rgb, self.camera, depth_m)
+
+    def down(self, index: int) -> NDArray[np.float64] | None:
+        """What gravity.txt says of the pair ``index``, ``(3,)``; None where it says nothing."""
+        found = self.downs[index] if self.downs else None
+        return None if found is None else np.array(found)
 
 
 @register_reader
@@ -90,6 +107,34 @@ class PairReader:
             raise DatasetError(f"{folder}: no pair of NNNNN.jpg and NNNNN.png here")
         alone = len(images) - len(pairs)
         notes = (f"{alone} of {len(images)} images have no depth image",) if alone else ()
+        told = read_gravity(folder / GRAVITY_FILE) if (folder / GRAVITY_FILE).is_file() else {}
         return PairPlace(
-            folder.name, camera, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), unit, notes
-        )
+            folder.name, camera, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), unit, notes,
+            downs=tuple(told.get(image.stem) for image, _ in pairs) if told else (),
+        )  # fmt: skip
+
+
+def read_gravity(path: Path) -> dict[str, _Direction]:
+    """Unit directions of gravity in the camera's frame, by the names of their pairs.
+
+    Raises:
+        DatasetError: a line is not a name and a unit direction; names it.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: not readable: {error}") from error
+    told: dict[str, _Direction] = {}
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        name, *numbers = line.split()
+        try:
+            x, y, z = map(float, numbers)
+        except ValueError:
+            x = y = z = np.nan
+        length = float(np.sqrt(x * x + y * y + z * z))
+        if not abs(length - 1.0) < _UNIT_TOLERANCE:
+            raise DatasetError(f"{path}: line {number}: expected a name and a unit direction x y z: {line!r}")
+        told[name] = (x / length, y / length, z / length)
+    return told

@@ -1,0 +1,396 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Heads that are told where down is, views turned upright, and sources that teach a part of depth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from killed_training import tiny_backbone
+from safetensors.torch import save_file
+from training_places import make_place
+
+from slamdepth.depth.gravity_field import gravity_field
+from slamdepth.depth.head import DepthHead, HeadEnsemble, HeadShape, load_head, save_head
+from slamdepth.depth.layout import pack_about
+from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
+from slamdepth.depth.training import gravity, loop
+from slamdepth.depth.training.augment import View, augmented_view, matching_view, plain_view
+from slamdepth.depth.training.caches import fill_cache, plan_caches
+from slamdepth.depth.training.config import AugmentConfig, LossConfig, TrainConfig, ViewConfig
+from slamdepth.depth.training.data import Place, open_place
+from slamdepth.depth.training.features import load_batch, load_mixed_batch
+from slamdepth.depth.training.losses import taught, total_loss
+from slamdepth.depth.training.stages import not_always_told
+from slamdepth.depth.training.views import Partner, SampleKey, make_view
+from slamdepth.depth.turning import roll_rad
+from slamdepth.errors import ConfigError, DatasetError, WeightsError
+from slamdepth.types import Camera, Frame
+
+SHAPE = HeadShape(taps=(0, 2), token_dim=24, dim=16, blocks=1, guide_dim=8, level_dim=4, gravity=True)
+_SEEDED = torch.Generator().manual_seed(1)
+ARGS = tuple(
+    torch.randn(shape, generator=_SEEDED) for shape in ((2, 2, 24, 3, 4), (2, 2, 24), (2, 3, 42, 56))
+)
+ROWS, COLUMNS = 70, 98
+CALM = AugmentConfig(upright_roll_deg=0.0, rolled=0.0, colour=0.0, blur=0.0, noise=0.0, jpeg=0.0)
+
+
+def unit(*xyz: float) -> np.ndarray:
+    return np.array(xyz) / np.linalg.norm(xyz)
+
+
+def fields(*downs: tuple[float, float, float], focal_px: float = 60.0) -> torch.Tensor:
+    return gravity_field(torch.tensor(downs), torch.full((len(downs),), focal_px), ROWS, 98)
+
+
+def test_the_field_is_the_sine_of_the_angle_below_the_horizon() -> None:
+    s, squared, size, one = fields((0.0, 1.0, 0.0))[0]  # an odd number of rows, none of columns
+    assert s.shape == (10, 14)
+    # the centre of block 0 is pixel 3, and the principal point lies at row 34.5
+    y, x = 7 * torch.arange(10)[:, None] + 3 - 34.5, 7 * torch.arange(14)[None] + 3 - 48.5
+    torch.testing.assert_close(s, y / (x**2 + y**2 + 60.0**2).sqrt())
+    assert bool((s[:5] < 0).all())
+    assert bool((s[5:] > 0).all())
+    torch.testing.assert_close(squared, s**2)
+    torch.testing.assert_close(size, s.abs())
+    assert bool((one == 1).all())
+
+
+def test_the_field_of_a_pitched_camera_and_of_one_with_a_middle_block() -> None:
+    down = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.5**0.5, 0.5**0.5]])
+    level, pitched = gravity_field(down, torch.full((2,), 50.0), 63, 77)[:, 0, 4, 5]
+    assert float(level) == pytest.approx(0.0, abs=1e-7)
+    assert float(pitched) == pytest.approx(np.sin(np.radians(45)), abs=1e-6)
+
+
+def test_of_unknown_gravity_nothing_is_told() -> None:
+    known, unknown = fields((0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
+    assert bool(known.any())
+    assert not bool(unknown.any())
+
+
+def test_an_untrained_head_is_not_moved_by_gravity_and_a_trained_one_is() -> None:
+    torch.manual_seed(2)
+    head = DepthHead(SHAPE).eval()
+    deaf = DepthHead(replace(SHAPE, gravity=False)).eval()
+    told = gravity_field(torch.tensor([[0.0, 0.8, 0.6], [0.6, 0.8, 0.0]]), torch.full((2,), 50.0), 42, 56)
+    assert head.level is not None
+    assert head.field is not None
+    torch.nn.init.normal_(head.level.out.weight)
+    torch.nn.init.normal_(head.out.weight)
+    extra = deaf.load_state_dict(head.state_dict(), strict=False).unexpected_keys
+    assert {name.rpartition(".")[0] for name in extra} == {"level.gravity", "field"}
+    with torch.inference_mode():
+        torch.testing.assert_close(head(*ARGS, told), deaf(*ARGS))
+        torch.nn.init.normal_(head.level.gravity.weight)
+        unmoved, level = deaf.coarse(*ARGS)[0][:, 0], head.coarse(*ARGS, told)[0][:, 0]
+        assert float((level - unmoved).mean(dim=(1, 2)).abs().min()) > 0.05
+        torch.nn.init.normal_(head.field.weight)
+        relief = head.coarse(*ARGS, told)[0][:, 0]
+        torch.testing.assert_close(relief.mean(dim=(1, 2)), level.mean(dim=(1, 2)))
+        assert float((relief - level).abs().max()) > 0.05
+        torch.testing.assert_close(head(*ARGS), head(*ARGS, torch.zeros_like(told)))
+        torch.testing.assert_close(head(*ARGS), deaf(*ARGS))
+
+
+def test_gravity_comes_back_from_the_file_and_needs_a_level(tmp_path: Path) -> None:
+    torch.manual_seed(3)
+    model = HeadEnsemble(replace(SHAPE, members=2))
+    for member in model.members:
+        torch.nn.init.normal_(member.field.weight)
+    save_head(tmp_path / "h.safetensors", model, {})
+    loaded, about = load_head(tmp_path / "h.safetensors")
+    assert loaded.shape == replace(SHAPE, members=2)
+    assert about["format"] == "slamdepth-depth-head-4"
+    told = fields((0.0, 0.8, 0.6), (0.6, 0.8, 0.0))[:, :, :6, :8]
+    with torch.inference_mode():
+        log_depth, _ = loaded(*ARGS, told)
+        outs = [member(*ARGS, told)[:, 0] for member in loaded.members]
+        assert float((log_depth - loaded(*ARGS)[0]).abs().max()) > 1e-4
+    torch.testing.assert_close(log_depth, (outs[0] + outs[1]) / 2)
+    with pytest.raises(ValueError, match="needs a level_dim above 0"):
+        DepthHead(replace(SHAPE, level_dim=0))
+    shape = json.dumps({**asdict(SHAPE), "level_dim": 0})
+    about = {"format": "slamdepth-depth-head-4", "shape": shape, "sigma_scale": "1.0"}
+    save_file({"a": torch.zeros(1)}, tmp_path / "bad.safetensors", metadata=pack_about(about))
+    with pytest.raises(WeightsError, match="needs a level_dim above 0"):
+        load_head(tmp_path / "bad.safetensors")
+
+
+def with_gravity(folder: Path, *downs: np.ndarray, count: int = 4) -> Place:
+    make_place(folder, count)
+    lines = [f"{k:05d} {' '.join(f'{value:.8f}' for value in down)}\n" for k, down in enumerate(downs)]
+    (folder / "gravity.txt").write_text("".join(lines))
+    return open_place(folder)
+
+
+def test_gravity_txt(tmp_path: Path) -> None:
+    downs = [unit(0.1, 0.9, 0.3), unit(-1, 0, 0)]
+    place = with_gravity(tmp_path / "room", *downs)
+    for index, down in enumerate(downs):
+        np.testing.assert_allclose(place.down(index), down, atol=1e-7)
+    assert place.down(2) is None
+    silent = open_place(make_place(tmp_path / "silent"))
+    assert silent.down(0) is None
+    other = with_gravity(tmp_path / "other", downs[0], -downs[1])  # a file of the same size
+    assert len({place.fingerprint, silent.fingerprint, other.fingerprint}) == 3
+
+
+@pytest.mark.parametrize(
+    "line", ["00001", "00001 0 1", "00001 0 1 0 0", "00001 0 one 0", "00001 0 2 0", "00001 nan 1 0"]
+)
+def test_a_bad_line_of_gravity_txt_is_named(tmp_path: Path, line: str) -> None:
+    folder = make_place(tmp_path / "room")
+    (folder / "gravity.txt").write_text(f"00000 0 1 0\n\n{line}\n")
+    with pytest.raises(DatasetError, match=r"gravity\.txt: line 3: expected a name and a unit direction"):
+        open_place(folder)
+    (folder / "gravity.txt").write_bytes(b"\xff\xfe")
+    with pytest.raises(DatasetError, match=r"gravity\.txt: not readable"):
+        open_place(folder)
+
+
+def test_down_is_what_the_place_says_or_else_what_lines_tell_and_is_remembered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[Camera] = []
+
+    def lines(image_rgb: np.ndarray, camera: Camera) -> np.ndarray | None:
+        looked.append(camera)
+        return None if len(looked) == 1 else unit(0, 0.8, 0.6)
+
+    monkeypatch.setattr(gravity, "held_upright_down", lines)
+    monkeypatch.setattr(gravity, "_found", {})
+    monkeypatch.setattr(gravity, "_MOST_REMEMBERED", 2)
+    place = with_gravity(tmp_path / "room", unit(0, 1, 0))
+    np.testing.assert_array_equal(gravity.down_of(place, 0), [0, 1, 0])
+    assert not looked
+    for _ in range(2):
+        assert gravity.down_of(place, 1) is None
+        np.testing.assert_array_equal(gravity.down_of(open_place(tmp_path / "room"), 2), [0, 0.8, 0.6])
+    assert looked == [place.camera] * 2
+    gravity.down_of(place, 3)
+    assert len(gravity._found) == 2  # the oldest was forgotten
+
+
+NORMAL, DISTANCE_M = unit(0.1, -0.2, 0.9), 2.0
+
+
+def plane_frame() -> Frame:
+    camera = Camera(120, 90, 100.0, 100.0, 60.2, 44.1)
+    u, v = np.meshgrid(np.arange(120.0), np.arange(90.0))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    depth = (DISTANCE_M / (rays @ NORMAL)).astype(np.float32)
+    return Frame(0, 0.0, np.repeat((depth * 60).astype(np.uint8)[..., None], 3, 2), camera, depth)
+
+
+def assert_the_plane_is_where_gravity_says(view: View, down: np.ndarray) -> None:
+    """The plane is turned as ``down`` was: known from its depths, it makes the same angle with it."""
+    v, u = np.nonzero(view.depth_m)
+    assert len(u) > 0.3 * view.depth_m.size
+    rays = np.column_stack([u - (COLUMNS - 1) / 2, v - (ROWS - 1) / 2, np.full(len(u), view.focal_px)])
+    points = rays / view.focal_px * view.depth_m[v, u][:, None]
+    found = np.linalg.lstsq(points, np.ones(len(points)), rcond=None)[0]
+    assert 1 / np.linalg.norm(found) == pytest.approx(DISTANCE_M, rel=0.01)
+    assert found @ view.down / np.linalg.norm(found) == pytest.approx(NORMAL @ down, abs=0.02)
+
+
+DOWNS = st.builds(
+    lambda roll, pitch: unit(
+        np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch), np.sin(pitch)
+    ),
+    st.floats(-np.pi, np.pi),
+    st.floats(-1.0, 1.0),
+)  # fmt: skip
+
+
+@given(down=DOWNS, seed=st.integers(0, 99))
+@settings(max_examples=25, deadline=None)
+def test_views_are_turned_upright(down: np.ndarray, seed: int) -> None:
+    frame = plane_frame()
+    calm = CALM.model_copy(update={"max_tilt_deg": 0.0})
+    for view in (
+        plain_view(frame, ROWS, COLUMNS, down),
+        augmented_view(frame, ROWS, COLUMNS, calm, np.random.default_rng(seed), down),
+    ):
+        assert np.linalg.norm(view.down) == pytest.approx(1.0)
+        assert view.down[0] == pytest.approx(0.0, abs=1e-9)
+        assert view.down[1] > 0
+        assert view.down[2] == pytest.approx(down[2])
+        assert_the_plane_is_where_gravity_says(view, down)
+    tilted = augmented_view(frame, ROWS, COLUMNS, CALM, np.random.default_rng(seed), down)
+    assert_the_plane_is_where_gravity_says(tilted, down)
+
+
+def rolled_deg(view: View) -> float:
+    return float(np.degrees(roll_rad(view.down)))
+
+
+def test_rolls_are_drawn_about_upright() -> None:
+    down, rng = unit(-0.7, 0.5, 0.1), np.random.default_rng(0)
+    calm = CALM.model_copy(update={"upright_roll_deg": 4.0, "max_tilt_deg": 0.0})
+    rolls = [rolled_deg(augmented_view(plane_frame(), 28, 42, calm, rng, down)) for _ in range(60)]
+    assert abs(np.mean(rolls)) < 1.6
+    assert 3.0 < np.std(rolls) < 5.2
+    wide = calm.model_copy(update={"rolled": 1.0, "max_roll_deg": 90.0})
+    rolls = [rolled_deg(augmented_view(plane_frame(), 28, 42, wide, rng, down)) for _ in range(60)]
+    assert np.abs(rolls).max() < 90
+    assert np.std(rolls) > 40
+
+
+@given(down=DOWNS, wanted=DOWNS, seed=st.integers(0, 99))
+@settings(max_examples=25, deadline=None)
+def test_a_partner_is_turned_until_gravity_points_as_wanted(
+    down: np.ndarray, wanted: np.ndarray, seed: int
+) -> None:
+    """However differently the two cameras were rolled, upside down too."""
+    pitch = np.arcsin(down[2]) + np.radians(10)  # no further apart than partners are
+    wanted = np.append(wanted[:2] / np.linalg.norm(wanted[:2]) * np.cos(pitch), np.sin(pitch))
+    view = matching_view(plane_frame(), ROWS, COLUMNS, CALM, np.random.default_rng(seed), down, wanted)
+    np.testing.assert_array_equal(view.down, wanted)
+    assert_the_plane_is_where_gravity_says(view, down)
+
+
+def mixing(*places: Place) -> tuple[ViewConfig, list[Partner]]:
+    augment = AugmentConfig(mixed=1.0, mixed_again=0.0)
+    config = ViewConfig(rows=56, columns=70, augment=augment, upright=True)
+    return config, [Partner(place, augment, 1.0) for place in places]
+
+
+def test_what_is_mixed_into_a_view_shares_its_gravity(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gravity, "held_upright_down", lambda image_rgb, camera: None)
+    rolled = with_gravity(tmp_path / "rolled", *[unit(1, 0.1, 0.05)] * 4)
+    level = with_gravity(tmp_path / "level", *[unit(0, 1, 0)] * 4)
+    steep = with_gravity(tmp_path / "steep", *[unit(0, 0.2, 0.9)] * 4)
+    silent = open_place(make_place(tmp_path / "silent"))
+    places, key = [rolled, silent], SampleKey(0, 1, 2)
+    config, partners = mixing(steep, level)
+    taken: list[tuple[float, float]] = []
+
+    def watched(*args: object) -> View:
+        view = matching_view(*args)  # type: ignore[arg-type]
+        taken.append((float(args[5][2]), float(view.down[2])))  # type: ignore[index]
+        return view
+
+    monkeypatch.setattr("slamdepth.depth.training.views.matching_view", watched)
+    mixed, again = (make_view(places, key, config, 3, partners) for _ in range(2))
+    np.testing.assert_array_equal(mixed.image_rgb, again.image_rgb)
+    alone = make_view(places, key, config, 3)
+    np.testing.assert_array_equal(mixed.down, alone.down)
+    assert mixed.down[1] > 0.9
+    assert (mixed.image_rgb != alone.image_rgb).any()
+    assert len(taken) == 2
+    assert all(abs(np.degrees(np.arcsin(of) - np.arcsin(to))) < 16 for of, to in taken)
+    # nothing fits: unmixed; nothing is known of the first: mixed as ever
+    for others in ([steep], [silent]):
+        unmixed = make_view(places, key, config, 3, mixing(*others)[1])
+        np.testing.assert_array_equal(unmixed.image_rgb, alone.image_rgb)
+    unknown, plain = SampleKey(1, 0, 0), config.model_copy(update={"upright": False})
+    as_ever = make_view(places, unknown, config, 3, partners)
+    np.testing.assert_array_equal(as_ever.image_rgb, make_view(places, unknown, plain, 3, partners).image_rgb)
+    assert not as_ever.down.any()
+    assert not make_view(places, key, plain, 3, partners).down.any()
+
+
+@pytest.mark.parametrize(("relief", "level"), [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+def test_only_what_a_sample_teaches_is_learnt(relief: float, level: float) -> None:
+    torch.manual_seed(4)
+    head = DepthHead(SHAPE)
+    target = torch.rand(2, 6, 8) + 1.0
+    target[:, :2] = 0.0
+    prediction = head.coarse(*ARGS)[0]
+    total_loss(
+        taught(prediction, target, torch.tensor([[relief, level]] * 2)), target, LossConfig()
+    ).backward()
+    assert head.level is not None
+    assert head.out.weight.grad is not None
+    of_relief = head.out.weight.grad[0].abs().max()  # log depth; the other row is its spread
+    of_level = head.level.out.bias.grad.abs().max()
+    for found, is_taught in ((of_relief, relief), (of_level, level)):
+        assert float(found) > 1e-3 if is_taught else float(found) < 1e-6  # rounding
+
+
+def test_a_sample_that_teaches_no_level_costs_nothing_for_its_scale() -> None:
+    torch.manual_seed(5)
+    prediction, target = torch.randn(2, 2, 6, 8), torch.rand(2, 6, 8) + 1.0
+    both, relief = torch.ones(2, 2), torch.tensor([[1.0, 0.0], [1.0, 1.0]])
+    assert taught(prediction, target, both) is prediction
+    losses = [total_loss(taught(prediction, f * target, relief), f * target, LossConfig()) for f in
+              (torch.ones(2, 1, 1), torch.tensor([3.0, 1.0])[:, None, None])]  # fmt: skip
+    torch.testing.assert_close(*losses)
+    told = taught(prediction, target, relief)
+    torch.testing.assert_close(told[1], prediction[1])
+    error = told[0, 0] - target[0].log()
+    assert float(error.mean()) == pytest.approx(0.0, abs=1e-6)
+
+
+def training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **head: object) -> TrainConfig:
+    monkeypatch.setenv("SLAMDEPTH_CACHE", str(tmp_path / "cache"))
+    with_gravity(tmp_path / "data" / "hall", *[unit(0.6, 0.8, 0.0)] * 4)
+    with_gravity(tmp_path / "data" / "loft", unit(0, 0.9, -0.1), count=2)
+    source = {"folder": str(tmp_path / "data")}
+    return TrainConfig.from_dict({
+        "output": str(tmp_path / "head.safetensors"),
+        "coarse_epochs": 2,
+        "batch": 3,
+        "sources": [
+            {**source, "places": [{"name": "hall", "samples": 4}], "teaches": "level", "held_out": ["loft"]},
+            {**source, "places": [{"name": "hall", "samples": 5}], "teaches": "relief"},
+        ],
+        "view": {"rows": 42, "columns": 56, "upright": True},
+        "head": {"taps": [0, 1], "dim": 16, "guide_dim": 8, "level_dim": 4, "gravity": True, **head},
+    })  # fmt: skip
+
+
+def test_caches_know_gravity_and_what_they_teach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, backbone = training(tmp_path, monkeypatch), tiny_backbone()
+    planned = plan_caches(config, "given")
+    caches = [fill_cache(plan, config, backbone) for plan in planned]
+    assert [cache.teaches for cache in caches] == ["level", "relief", "both"]
+    np.testing.assert_allclose(caches[2].down[0], unit(0, 0.9, -0.1), atol=1e-6)  # the plain view of the loft
+    field, depth = load_batch(caches[2], np.array([0]), "cpu")[3:]
+    focal_px = torch.tensor([float(caches[2].focal_factor[0]) * CANONICAL_FOCAL_PX])
+    torch.testing.assert_close(field, gravity_field(torch.from_numpy(caches[2].down[:1]), focal_px, 42, 56))
+    assert depth.shape == (1, 42, 56)
+    batch, teaches = load_mixed_batch(caches, np.array([[2, 0], [1, 4], [0, 3], [1, 0]]), "cpu")
+    assert teaches.tolist() == [[0, 1], [1, 0], [1, 0], [1, 1]]
+    torch.testing.assert_close(batch[3][3], field[0])
+    torch.testing.assert_close(batch[0][1], load_batch(caches[1], np.array([0]), "cpu")[0][0])
+    lying = config.model_copy(update={"view": config.view.model_copy(update={"upright": False})})
+    assert not {plan.folder for plan in planned} & {plan.folder for plan in plan_caches(lying, "given")}
+
+
+def test_some_samples_are_not_told() -> None:
+    torch.manual_seed(6)
+    field = torch.ones(400, 4, 2, 2)
+    batch = (torch.zeros(1), torch.zeros(1), torch.zeros(1), field, torch.zeros(1))
+    told = not_always_told(batch, 0.25)[3]
+    assert bool((told.amin(dim=(1, 2, 3)) == told.amax(dim=(1, 2, 3))).all())
+    assert float(told.mean()) == pytest.approx(0.75, abs=0.08)
+    torch.testing.assert_close(not_always_told(batch, 0.0)[3], field)
+
+
+def test_a_head_learns_with_gravity_the_same_for_the_same_seed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = training(tmp_path, monkeypatch, unknown_gravity=0.5)
+    result = loop.train_depth(config, backbone=tiny_backbone())
+    first = result.output.read_bytes()
+    head, _ = load_head(result.output)
+    assert head.shape.gravity
+    assert bool(head.members[0].field.weight.any())
+    assert bool(head.members[0].level.gravity.weight.any())
+    assert loop.train_depth(config, backbone=tiny_backbone()).output.read_bytes() == first
+
+
+def test_settings_that_do_not_go_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match="setting 'head': gravity needs a level_dim above 0"):
+        training(tmp_path, monkeypatch, level_dim=0)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images turned upright, and what was predicted of them turned back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slamdepth.depth.turning import roll_rad, turned, turned_back
+from slamdepth.types import Camera, DepthKind, DepthPrediction
+
+CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+
+
+def prediction(values: np.ndarray, sigma: float | None = None) -> DepthPrediction:
+    values = values.astype(np.float32)
+    return DepthPrediction(values, DepthKind.METRIC, None if sigma is None else np.full_like(values, sigma))
+
+
+def test_roll_is_positive_where_down_points_to_the_right() -> None:
+    assert roll_rad(np.array([0.5, 0.5, 0.7])) == pytest.approx(np.pi / 4)
+    assert roll_rad(np.array([0.0, 1.0, 0.0])) == 0.0
+
+
+def test_what_is_down_in_the_image_comes_to_lie_below() -> None:
+    image = np.zeros((120, 160, 3), np.uint8)
+    roll = 0.5
+    u, v = 79.5 + 40 * np.sin(roll), 59.5 + 40 * np.cos(roll)
+    image[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2] = 255
+    row, column = np.argwhere(turned(image, CAMERA, -roll)[..., 0] > 128).mean(axis=0)
+    assert (row, column) == (pytest.approx(99.5, abs=1), pytest.approx(79.5, abs=1))
+
+
+@pytest.mark.parametrize("roll", [0.3, -1.2])
+def test_there_and_back(roll: float) -> None:
+    v, u = np.mgrid[:120, :160]
+    depth = 2.0 + 0.005 * u + 0.008 * v
+    M_down = np.array([[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]])
+    x, y = u - 79.5, v - 59.5
+    upright = 2.0 + 0.005 * (M_down[0, 0] * x + M_down[0, 1] * y + 79.5)
+    upright = upright + 0.008 * (M_down[1, 0] * x + M_down[1, 1] * y + 59.5)
+    back = turned_back(prediction(upright), prediction(depth), CAMERA, roll).values
+    np.testing.assert_allclose(back, depth, atol=0.02)  # a pixel is 0.005 to 0.008
+
+
+def test_corners_that_were_cut_off_take_the_other_prediction_at_its_level() -> None:
+    as_taken = prediction(np.full((120, 160), 4.0), 0.3)
+    back = turned_back(prediction(np.full((120, 160), 2.0), 0.1), as_taken, CAMERA, 0.6)
+    np.testing.assert_allclose(back.values, 2.0)
+    assert back.sigma_log is not None
+    assert back.sigma_log[60, 80] == np.float32(0.1)
+    assert back.sigma_log[0, 0] == np.float32(0.3)
+
+
+def test_not_turned_is_the_same() -> None:
+    image = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(turned(image, CAMERA, 0.0), image)
+    depth = prediction(image[..., 0].astype(np.float32) + 1.0)
+    back = turned_back(depth, prediction(np.ones((120, 160))), CAMERA, 0.0)
+    np.testing.assert_array_equal(back.values, depth.values)
+    assert back.sigma_log is None
