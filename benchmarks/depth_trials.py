@@ -57,17 +57,22 @@ class Trial:
         change: settings by dotted name.
         build, loss: instead of the shipped head and the settings' loss.
         is_real_only: without the other sources (synthetic rooms).
+        all_teach_both: every source teaches relief and level, whatever the settings say.
     """
 
     change: dict[str, Any] = field(default_factory=dict)
     build: Build = DepthHead
     loss: Loss | None = None
     is_real_only: bool = False
+    all_teach_both: bool = False
 
 
 TRIALS: dict[str, Trial] = {
     "as shipped": Trial(),
-    "relief and level by the same layers": Trial({"head.level_dim": 0}),
+    "not told where down is": Trial({"head.gravity": False}),
+    "as held, not turned upright": Trial({"head.gravity": False, "view.upright": False}),
+    "every source teaches both": Trial(all_teach_both=True),
+    "relief and level by the same layers": Trial({"head.level_dim": 0, "head.gravity": False}),
     "linear head": Trial(build=LinearHead),
     "DPT-like head": Trial(build=DptLikeHead),
     "normals too": Trial(loss=normals_too),
@@ -92,7 +97,12 @@ def trial_config(base: TrainConfig, trial: Trial, left_out: Sequence[str], sampl
     values = config_without(unmixed(base), None, Path("unused"), samples=samples).model_dump()
     first = base.sources[0].folder
     sources = []
+    values["head"]["down_dim"] = 0  # gravity is known here
     for source in values["sources"]:
+        if source["teaches"] == "down":
+            continue
+        if trial.all_teach_both:
+            source = {**source, "teaches": "both"}
         is_real = source["folder"] == first
         if is_real and source["places"][0]["name"] in left_out:
             source = {**source, "places": [], "held_out": [source["places"][0]["name"]]}

@@ -258,7 +258,10 @@ def test_a_left_out_place_is_left_out_of_every_source() -> None:
 def test_one_head_of_what_is_not_mixed() -> None:
     base = TrainConfig.from_yaml(DEFAULT_CONFIG)
     plain = unmixed(base)
-    assert [source.folder for source in plain.sources] == ["depth_training", "synth"]
+    assert [(source.folder, source.teaches) for source in plain.sources] == [
+        ("depth_training", "level"), ("synth", "relief"), ("synth", "both"),
+        ("depth_training", "down"), ("synth", "down"), ("synth", "down"),
+    ]  # fmt: skip
     config = config_without(plain, "cafe_nyu", Path("head.safetensors"))
     assert config.members == 1
     assert all(source.members is None and not source.augment.mixed for source in config.sources)
