@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Render synthetic rooms as training pairs (NNNNN.jpg + NNNNN.png + camera.json).
+"""Render synthetic rooms as training pairs (NNNNN.jpg + NNNNN.png + camera.json + gravity.txt).
 
 The rooms are those of ``data_scripts/training_rooms.py``. Views are chosen for variety,
 not for a smooth path: a random point, often one on a table, is looked at from a random
 distance and direction, down to almost straight from above, half of the time with a rolled
 camera. With ``--furniture`` they are those of ``data_scripts/furnished_rooms.py`` instead, and in a quarter
 of the views the camera is where one holds a phone standing or sitting, and looks about. With ``--plain``
-the rooms have little texture, and half of the views are of that kind. Same arguments, same files; rooms
-that are there already are kept.
+the rooms have little texture, and half of the views are of that kind. With ``--by-hand`` every view is as
+somebody who stands or sits would film it, nearly upright. ``gravity.txt`` says where down is: lines
+``NNNNN x y z``, a view's name and the unit direction of gravity in its camera's frame (x right, y down,
+z forward). Same arguments, same files; rooms that are there already are kept.
 
     python data_scripts/render_training_rooms.py OUT --rooms 30 --views 20 --first-seed 1000
 """
@@ -160,14 +162,17 @@ def room_views(
     return views
 
 
-def write_gravity(folder: Path, rooms: int) -> None:
+def write_gravity(folder: Path) -> None:
     """``gravity.txt`` of what the rooms' notes say: a view's name and the direction of gravity in its camera.
+
+    Rooms of earlier runs count too, since their views are still there.
 
     Raises:
         ValueError: a room was rendered before notes said so.
     """
-    notes = [folder / f".{room:05d}.done" for room in range(rooms)]
-    for room, note in enumerate(notes):
+    rooms = sorted(int(note.stem[1:]) for note in folder.glob(".[0-9]*.done"))
+    notes = [folder / f".{room:05d}.done" for room in rooms]
+    for room, note in zip(rooms, notes, strict=True):
         if not note.read_text(encoding="utf-8") and (folder / f"{room * 1000:05d}.png").exists():
             raise ValueError(f"{note}: does not say where down is; delete it to render the room again")
     lines = "".join(note.read_text(encoding="utf-8") for note in notes)
@@ -213,10 +218,10 @@ def main() -> None:
                 lines.append(f"{name.name} {down[0]:.6f} {down[1]:.6f} {down[2]:.6f}\n")
                 cv2.imwrite(f"{name}.png", np.clip(np.round(depth * 1000), 0, 65535).astype(np.uint16))
                 cv2.imwrite(f"{name}.jpg", image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 93])
-            done.write_text("".join(lines), encoding="utf-8")
+            write_text(done, "".join(lines))
         print(f"room {room + 1} of {arguments.rooms}", flush=True)
     try:
-        write_gravity(folder, arguments.rooms)
+        write_gravity(folder)
     except ValueError as error:
         parser.error(str(error))
 

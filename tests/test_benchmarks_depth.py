@@ -19,7 +19,7 @@ from benchmarks.depth_rows import judged_row, mean_row, table
 from slamdepth.depth.dinov2_mlp import MlpHead
 from slamdepth.depth.training.config import TrainConfig
 from slamdepth.errors import ConfigError
-from slamdepth.types import Camera, Frame
+from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 
 def frame_of(focal_px: float = 60.0) -> Frame:
@@ -171,6 +171,28 @@ def test_stages_add_up_and_the_vit_is_found() -> None:
         stage_times(ConstantDepth(1.0), noise("48x64"), "cpu", 1, 0)
     with pytest.raises(ConfigError, match="--frame 48"):
         noise("48")
+
+
+def test_a_model_that_looks_twice_has_its_looks_added_up() -> None:
+    from test_depth_models import tiny_model
+
+    from benchmarks.depth_latency_stages import frame_of as noise
+    from benchmarks.depth_latency_stages import stage_times
+
+    class Twice:
+        name, kind, weights = "twice", DepthKind.METRIC, ()
+
+        def __init__(self) -> None:
+            self._model = tiny_model()
+            self.vit = self._model._backbone
+
+        def predict(self, frame: Frame) -> DepthPrediction:
+            self._model.predict(frame)
+            return self._model.predict(frame)
+
+    times = stage_times(Twice(), noise("48x64"), "cpu", repeats=1, warm_up=1)
+    assert times["resize_ms"] + times["vit_ms"] + times["head_ms"] == pytest.approx(times["together_ms"])
+    assert min(times.values()) > 0
 
 
 def test_forms_of_the_vit_are_measured_against_eager() -> None:

@@ -36,9 +36,9 @@ def turned_back(
     """
     values = _back(upright.values, camera, roll_rad)
     seen = values > 0
-    level = np.float32(1.0)
-    if seen.any():
-        level = np.exp(np.median(np.log(values[seen]) - np.log(as_taken.values[seen])), dtype=np.float32)
+    level, both = np.float32(1.0), seen & (as_taken.values > 0)
+    if both.any():
+        level = np.exp(np.median(np.log(values[both]) - np.log(as_taken.values[both])), dtype=np.float32)
     sigma = as_taken.sigma_log
     if upright.sigma_log is not None and sigma is not None:
         sigma = np.where(seen, _back(upright.sigma_log, camera, roll_rad), sigma)
