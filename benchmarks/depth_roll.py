@@ -41,6 +41,7 @@ from slamdepth.types import DepthPrediction, Frame, Trajectory
 
 _FARTHEST_S = 0.05
 _WITHIN_DEG = 20
+_LABELS = ("as taken", "turned upright", "told which way is down")
 
 
 def pose_near(truth: Trajectory, frame: Frame) -> NDArray[np.float64] | None:
@@ -51,14 +52,14 @@ def pose_near(truth: Trajectory, frame: Frame) -> NDArray[np.float64] | None:
     return truth.T_world_camera[k]
 
 
-def true_roll(truth: Trajectory, up_w: NDArray[np.float64]) -> Callable[[Frame], float | None]:
-    """The roll of a frame by the true pose nearest in time; None where there is none near."""
+def true_down(truth: Trajectory, up_w: NDArray[np.float64]) -> Callable[[Frame], NDArray[np.float64] | None]:
+    """Gravity ``(3,)`` in a frame's camera by the true pose nearest in time; None where none is near."""
 
-    def roll(frame: Frame) -> float | None:
+    def down(frame: Frame) -> NDArray[np.float64] | None:
         T_world_camera = pose_near(truth, frame)
-        return None if T_world_camera is None else roll_rad(T_world_camera[:3, :3].T @ -up_w)
+        return None if T_world_camera is None else np.asarray(T_world_camera[:3, :3].T @ -up_w)
 
-    return roll
+    return down
 
 
 def predicted_upright(
@@ -77,8 +78,10 @@ def predicted_upright(
 
 def judged(
     dataset: Dataset, model: DepthModel, up_w: NDArray[np.float64], stride: int
-) -> tuple[DepthJudgement, DepthJudgement]:
-    """As taken, and turned upright; where no true pose tells the roll, both are as taken.
+) -> tuple[DepthJudgement, DepthJudgement, DepthJudgement, list[float]]:
+    """As taken, turned upright and told the true direction of gravity, and how far off, in degrees, the one
+    is that the model finds itself: 180 where it finds none. Where no true pose tells gravity, the first two
+    are of the image as taken, and it counts in neither of the others.
 
     Raises:
         DatasetError: the sequence has no ground truth or no depth.
@@ -86,47 +89,24 @@ def judged(
     if dataset.ground_truth is None:
         raise DatasetError(f"{dataset.path}: has no ground truth to tell the roll by; leave it out")
     place = SequencePlace.of(dataset)
-    roll_of = true_roll(dataset.ground_truth, up_w)
-    upright = DepthJudge(model.kind)
+    down_of = true_down(dataset.ground_truth, up_w)
+    upright, told, errors_deg = DepthJudge(model.kind), DepthJudge(model.kind), []
 
-    def turn(frame: Frame, plain: DepthPrediction) -> None:
+    def look(frame: Frame, plain: DepthPrediction) -> None:
         assert frame.depth_m is not None
-        roll = roll_of(frame)
-        prediction = plain if roll is None else predicted_upright(model, frame, roll, plain)
-        upright.add(prediction, frame.depth_m)
-
-    as_taken = judge_depth(model, readable(place, thinned(place, stride)), watch=turn)
-    turned_upright = upright.judge()
-    assert turned_upright is not None
-    return as_taken, turned_upright
-
-
-def judged_knowing(
-    dataset: Dataset, model: DepthModel, up_w: NDArray[np.float64], stride: int
-) -> tuple[DepthJudgement, list[float]]:
-    """Depth by a model that is told the true direction of gravity, and how far off, in degrees, the one it
-    finds itself is: 180 where it finds none. Frames without a true pose are left out of both.
-
-    Raises:
-        DatasetError: the sequence has no ground truth or no depth.
-    """
-    if dataset.ground_truth is None:
-        raise DatasetError(f"{dataset.path}: has no ground truth to tell gravity by; leave it out")
-    place = SequencePlace.of(dataset)
-    judge, errors_deg = DepthJudge(model.kind), []
-    for frame in readable(place, thinned(place, stride)):
-        T_world_camera = pose_near(dataset.ground_truth, frame)
-        if T_world_camera is None or frame.depth_m is None:
-            continue
-        down = T_world_camera[:3, :3].T @ -up_w
-        found = model.predict(frame).gravity
-        cosine = -1.0 if found is None else float(np.clip(found @ down, -1.0, 1.0))
+        if (down := down_of(frame)) is None:
+            upright.add(plain, frame.depth_m)
+            return
+        upright.add(predicted_upright(model, frame, roll_rad(down), plain), frame.depth_m)
+        told.add(model.predict(replace(frame, gravity=down)), frame.depth_m)
+        cosine = -1.0 if plain.gravity is None else float(np.clip(plain.gravity @ down, -1.0, 1.0))
         errors_deg.append(float(np.degrees(np.arccos(cosine))))
-        judge.add(model.predict(replace(frame, gravity=down)), frame.depth_m)
-    judgement = judge.judge()
-    if judgement is None:
+
+    as_taken = judge_depth(model, readable(place, thinned(place, stride)), watch=look)
+    turned_upright, knowing = upright.judge(), told.judge()
+    if turned_upright is None or knowing is None:
         raise DatasetError(f"{dataset.path}: no frame with depth has a true pose near in time")
-    return judgement, errors_deg
+    return as_taken, turned_upright, knowing, errors_deg
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
@@ -169,11 +149,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for path in options.sequences:
         dataset = open_dataset(path)
         with Console(stderr=True).status(f"{dataset.name}: predicting"):
-            both = judged(dataset, model, up_w, options.stride)
-        for label, judgement in zip(("as taken", "turned upright"), both, strict=True):
+            *judgements, errors_deg = judged(dataset, model, up_w, options.stride)
+        for label, judgement in zip(_LABELS, judgements, strict=True):
             rows.append({"sequence": dataset.name, "images": label, **judgement.to_dict()})
-        told, errors_deg = judged_knowing(dataset, model, up_w, options.stride)
-        rows.append({"sequence": dataset.name, "images": "told which way is down", **told.to_dict()})
         found.append(
             f"{dataset.name}: found which way is down to {_WITHIN_DEG} degrees in "
             f"{np.mean(np.array(errors_deg) <= _WITHIN_DEG):.0%} of {len(errors_deg)} images, "

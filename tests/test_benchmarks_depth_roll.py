@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from made_up import MadeUpDataset
 
-from benchmarks.depth_roll import judged, judged_knowing, main, predicted_upright, true_roll
+from benchmarks.depth_roll import judged, main, predicted_upright, true_down
 from slamdepth.depth.turning import roll_rad
 from slamdepth.geometry import se3_exp
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Trajectory
@@ -69,12 +69,14 @@ def test_an_image_is_shown_upright_and_its_depth_comes_back_as_taken(angle: floa
     assert (made.sigma_log == np.float32(0.1)).all()
 
 
-def test_the_roll_of_a_frame_is_that_of_the_pose_nearest_in_time_if_one_is_near() -> None:
+def test_gravity_of_a_frame_is_that_of_the_pose_nearest_in_time_if_one_is_near() -> None:
     truth = Trajectory(np.array([0.0, 1.0]), np.stack([rolled(0.3), rolled(-0.2)]))
-    roll = true_roll(truth, UP)
+    down = true_down(truth, UP)
     frame = Frame(0, 0.98, ramp_as_taken(0.0), CAMERA)
-    assert roll(frame) == pytest.approx(-0.2)
-    assert roll(replace(frame, timestamp_s=0.5)) is None
+    found = down(frame)
+    assert found is not None
+    assert roll_rad(found) == pytest.approx(-0.2)
+    assert down(replace(frame, timestamp_s=0.5)) is None
 
 
 class FloorByRows(Brightness):
@@ -101,10 +103,11 @@ class RolledFloor(MadeUpDataset):
         return Frame(index, float(self.timestamps_s[index]), image, CAMERA, depth_m.astype(np.float32))
 
 
-def test_each_image_is_predicted_once_as_taken_and_once_upright() -> None:
+def test_each_image_is_predicted_once_as_taken_once_upright_and_once_told() -> None:
     model = FloorByRows()
-    as_taken, upright = judged(RolledFloor(), model, UP, stride=1)
-    assert len(model.seen) == 4 + 3
+    as_taken, upright, told, errors_deg = judged(RolledFloor(), model, UP, stride=1)
+    assert len(model.seen) == 4 + 3 + 3
+    assert len(told.per_frame["as_predicted.abs_rel"]) == len(errors_deg) == 3
     of_taken, of_upright = (np.array(j.per_frame["as_predicted.abs_rel"]) for j in (as_taken, upright))
     assert (of_taken > 0.08).all()
     assert (of_upright[[0, 1, 3]] < 0.03).all()  # what is left was cut off at the corners
@@ -123,7 +126,7 @@ class Knowing(FloorByRows):
 
 
 def test_a_model_is_told_which_way_is_down_and_asked() -> None:
-    told, errors_deg = judged_knowing(RolledFloor(), Knowing(), UP, stride=1)
+    _, _, told, errors_deg = judged(RolledFloor(), Knowing(), UP, stride=1)
     assert (np.array(told.per_frame["as_predicted.abs_rel"]) < 0.03).all()
     np.testing.assert_allclose(errors_deg, [np.degrees(0.4)] * 2 + [180.0], atol=1e-6)
 
