@@ -131,8 +131,7 @@ def train_head(
         for step in range(steps):
             chosen = samples[order.choice(len(samples), min(config.batch, len(samples)), replace=False)]
             batch, teaches = load_mixed_batch(caches, chosen, "cpu")
-            if config.head.gravity:
-                batch = not_always_told(batch, config.head.unknown_gravity)
+            batch = not_always_told(batch, config.head)
             prediction, target = predict(head, batch, False)
             prediction = taught(prediction, target, teaches)
             loss = (

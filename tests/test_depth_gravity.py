@@ -23,7 +23,7 @@ from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
 from slamdepth.depth.training import gravity, loop
 from slamdepth.depth.training.augment import View, augmented_view, matching_view, plain_view
 from slamdepth.depth.training.caches import fill_cache, plan_caches
-from slamdepth.depth.training.config import AugmentConfig, LossConfig, TrainConfig, ViewConfig
+from slamdepth.depth.training.config import AugmentConfig, HeadConfig, LossConfig, TrainConfig, ViewConfig
 from slamdepth.depth.training.data import Place, open_place
 from slamdepth.depth.training.features import load_batch, load_mixed_batch
 from slamdepth.depth.training.losses import taught, total_loss
@@ -108,7 +108,7 @@ def test_gravity_comes_back_from_the_file_and_needs_a_level(tmp_path: Path) -> N
     save_head(tmp_path / "h.safetensors", model, {})
     loaded, about = load_head(tmp_path / "h.safetensors")
     assert loaded.shape == replace(SHAPE, members=2)
-    assert about["format"] == "slamdepth-depth-head-4"
+    assert about["format"] == "slamdepth-depth-head-5"
     told = fields((0.0, 0.8, 0.6), (0.6, 0.8, 0.0))[:, :, :6, :8]
     with torch.inference_mode():
         log_depth, _ = loaded(*ARGS, told)
@@ -118,7 +118,7 @@ def test_gravity_comes_back_from_the_file_and_needs_a_level(tmp_path: Path) -> N
     with pytest.raises(ValueError, match="needs a level_dim above 0"):
         DepthHead(replace(SHAPE, level_dim=0))
     shape = json.dumps({**asdict(SHAPE), "level_dim": 0})
-    about = {"format": "slamdepth-depth-head-4", "shape": shape, "sigma_scale": "1.0"}
+    about = {"format": "slamdepth-depth-head-5", "shape": shape, "sigma_scale": "1.0"}
     save_file({"a": torch.zeros(1)}, tmp_path / "bad.safetensors", metadata=pack_about(about))
     with pytest.raises(WeightsError, match="needs a level_dim above 0"):
         load_head(tmp_path / "bad.safetensors")
@@ -372,10 +372,13 @@ def test_some_samples_are_not_told() -> None:
     torch.manual_seed(6)
     field = torch.ones(400, 4, 2, 2)
     batch = (torch.zeros(1), torch.zeros(1), torch.zeros(1), field, torch.zeros(1))
-    told = not_always_told(batch, 0.25)[3]
+    config = HeadConfig(level_dim=4, gravity=True, unknown_gravity=0.25)
+    told = not_always_told(batch, config)[3]
     assert bool((told.amin(dim=(1, 2, 3)) == told.amax(dim=(1, 2, 3))).all())
     assert float(told.mean()) == pytest.approx(0.75, abs=0.08)
-    torch.testing.assert_close(not_always_told(batch, 0.0)[3], field)
+    always, never = config.model_copy(update={"unknown_gravity": 0.0}), HeadConfig()
+    torch.testing.assert_close(not_always_told(batch, always)[3], field)
+    assert not_always_told(batch, never) is batch  # such a head does not read it
 
 
 def test_a_head_learns_with_gravity_the_same_for_the_same_seed(

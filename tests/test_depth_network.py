@@ -191,12 +191,15 @@ def test_head_file_round_trip(tmp_path: Path) -> None:
     assert (tmp_path / "h.safetensors").read_bytes() == first
 
 
-def test_a_doubt_says_how_sure_all_members_are_and_comes_back_from_the_file(tmp_path: Path) -> None:
+def test_a_doubt_says_with_all_members_how_sure_they_are_and_comes_back_from_the_file(tmp_path: Path) -> None:
     torch.manual_seed(1)
     model = HeadEnsemble(replace(SMALL, doubt=4), sigma_scale=2.0).eval()
     assert model.doubt is not None
     torch.nn.init.zeros_(model.doubt.out.weight)
     torch.nn.init.constant_(model.doubt.out.bias, math.log(0.5) + 2)
+    for member, own in zip(model.members, (0.2, 0.05), strict=True):
+        torch.nn.init.zeros_(member.out.weight)
+        member.out.bias = torch.nn.Parameter(torch.tensor([0.0, math.log(own)]))
     args = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56)
     save_head(tmp_path / "h.safetensors", model, {})
     loaded, _ = load_head(tmp_path / "h.safetensors")
@@ -204,7 +207,8 @@ def test_a_doubt_says_how_sure_all_members_are_and_comes_back_from_the_file(tmp_
         log_depth, sigma = loaded(*args)
         outs = [member(*args) for member in loaded.members]
     torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
-    torch.testing.assert_close(sigma, torch.full_like(sigma, 2.0 * 2.0**0.5 * 0.5), rtol=2e-3, atol=0)
+    spread = math.sqrt(0.5 * math.sqrt(0.2 * 0.05))
+    torch.testing.assert_close(sigma, torch.full_like(sigma, 2.0 * 2.0**0.5 * spread), rtol=2e-3, atol=0)
 
 
 def level_and_relief(head: DepthHead, tokens: torch.Tensor, cls: torch.Tensor) -> tuple[float, torch.Tensor]:
@@ -220,10 +224,10 @@ def test_a_level_told_apart_reads_what_is_common_to_a_view_and_its_relief_does_n
     level, relief = level_and_relief(head, tokens, cls)
     assert level == pytest.approx(math.log(1.8), abs=1e-5)  # as it starts
     torch.nn.init.normal_(head.level.out.weight)
-    told = [level_and_relief(head, *args) for args in ((tokens + common, cls), (tokens, cls + 1))]
-    for other_level, same_relief in told:
-        assert abs(other_level - level) > 0.01
-        torch.testing.assert_close(same_relief, relief, atol=1e-5, rtol=1e-4)
+    other_level, same_relief = level_and_relief(head, tokens + common, cls)
+    assert abs(other_level - level) > 0.01
+    torch.testing.assert_close(same_relief, relief, atol=1e-5, rtol=1e-4)
+    assert level_and_relief(head, tokens, cls + 1)[0] == level_and_relief(head, tokens, cls)[0]
 
 
 def test_levels_are_averaged_too_and_come_back_from_the_file(tmp_path: Path) -> None:
@@ -254,6 +258,16 @@ def test_heads_of_earlier_formats_are_read(tmp_path: Path, number: int, without:
     loaded, _ = load_head(tmp_path / "old.safetensors")
     assert loaded.doubt is None
     assert loaded.sigma_scale == 1.5
+
+
+@pytest.mark.parametrize("part", ["doubt", "level_dim"])
+def test_heads_of_earlier_formats_whose_parts_were_others_are_refused(tmp_path: Path, part: str) -> None:
+    shape = replace(SMALL, **{part: 4})
+    tensors = {name: value.half().contiguous() for name, value in HeadEnsemble(shape).state_dict().items()}
+    about = {"format": "slamdepth-depth-head-4", "shape": json.dumps(asdict(shape)), "sigma_scale": "1.0"}
+    save_file(tensors, tmp_path / "old.safetensors", metadata=pack_about(about))
+    with pytest.raises(WeightsError, match=r"earlier version of slamdepth .* train it again"):
+        load_head(tmp_path / "old.safetensors")
 
 
 def test_head_file_of_another_kind_is_refused(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from slamdepth.depth.training import down as training_down
 from slamdepth.depth.training import loop
 from slamdepth.depth.training.caches import of_gravity, of_member, plan_caches
 from slamdepth.depth.training.config import TrainConfig
-from slamdepth.depth.training.down import learn_down, wrong_directions
+from slamdepth.depth.training.down import learn_down, offered_directions
 from slamdepth.depth.training.features import FeatureCache
 from slamdepth.depth.training.progress import silent
 from slamdepth.errors import ConfigError
@@ -53,7 +53,7 @@ def seen_from_below_the_horizon(count: int, seed: int) -> FeatureCache:
 def test_directions_offered_are_gravity_first_and_others() -> None:
     rng = np.random.default_rng(0)
     down = np.array([0.6, 0.0, 0.8])
-    offered = wrong_directions(down, rng)
+    offered = offered_directions(down, rng)
     np.testing.assert_allclose(np.linalg.norm(offered, axis=1), 1.0)
     np.testing.assert_allclose(offered[0], down)
     np.testing.assert_allclose(offered[2], -down)
@@ -66,7 +66,7 @@ def test_it_learns_what_goes_with_being_below(monkeypatch: pytest.MonkeyPatch) -
     scorer = learn_down([seen_from_below_the_horizon(64, 0)], SHAPE, 0, "cpu", silent)
     other, rng, right = seen_from_below_the_horizon(30, 1), np.random.default_rng(2), 0
     for k in range(len(other)):
-        offered = wrong_directions(other.down[k].astype(float), rng)
+        offered = offered_directions(other.down[k].astype(float), rng)
         fields = training_down.token_fields(torch.from_numpy(offered).float(), 60.0, 56, 70)
         tokens = torch.from_numpy(other.tokens[k : k + 1]).float()
         with torch.inference_mode():

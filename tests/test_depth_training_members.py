@@ -51,7 +51,7 @@ def test_a_member_learns_from_its_sources_alone(
     real = loop._epoch
 
     def spy(config: TrainConfig, caches: list[FeatureCache], *rest: Any) -> float:
-        seen.append((rest[3], sum(len(cache) for cache in caches)))  # rest: head, optimiser, epoch, member
+        seen.append((rest[4], sum(map(len, rest[0]))))  # rest: views, head, optimiser, epoch, member
         return real(config, caches, *rest)
 
     monkeypatch.setattr(loop, "_epoch", spy)

@@ -12,12 +12,20 @@ import torch
 from killed_training import tiny_backbone
 from training_places import make_place
 
-from slamdepth.depth.doubt import RELIEF, Doubt, relief
+from slamdepth.depth.doubt import FEATURES, Doubt, features, together
 from slamdepth.depth.head import load_head
 from slamdepth.depth.training import loop, out_of_fold
 from slamdepth.depth.training.caches import Encoder, plan_caches
 from slamdepth.depth.training.config import AugmentConfig, TrainConfig
-from slamdepth.depth.training.out_of_fold import Errors, Fold, fit_doubt, plan_folds, sigma_scale, surest_half
+from slamdepth.depth.training.out_of_fold import (
+    Errors,
+    fit_doubt,
+    plan_folds,
+    read_by,
+    sigma_scale,
+    spread_of,
+    surest_half,
+)
 from slamdepth.depth.training.plan import plan_training
 from slamdepth.depth.training.progress import TrainStep
 from slamdepth.errors import ConfigError
@@ -56,53 +64,82 @@ def made_up_errors(seed: int = 0, places: int = 3) -> Errors:
     view = torch.arange(count) // 100
     means = torch.stack([error[view == k].mean() for k in range(count // 100)])[view]
     own = torch.randn(count)
-    return Errors(tokens.half(), torch.randn(count, RELIEF), error, error / means, own, view % places, view)
+    return Errors(tokens.half(), torch.randn(count, FEATURES), error, error / means, own, view % places, view)
 
 
 def test_it_learns_where_errors_are_large_and_how_large() -> None:
     doubt = fit_doubt(made_up_errors(), seed=0)
     other = made_up_errors(seed=1)
-    features = out_of_fold.features_of(doubt, other)
-    assert surest_half(doubt.judge(features), other) < 0.4  # of 1 and 6 in equal parts: 1 / 3.5 = 0.29
+    judged = doubt.judge(read_by(doubt, other))
+    assert surest_half(judged, other) < 0.4  # of 1 and 6 in equal parts: 1 / 3.5 = 0.29
     assert surest_half(other.own, other) == pytest.approx(1, abs=0.1)
-    spread, is_large = doubt.judge(features).exp(), other.tokens[:, 0] > 0
+    torch.testing.assert_close(spread_of(doubt, other), (other.own + judged) / 2)
+    spread, is_large = judged.exp(), other.tokens[:, 0] > 0
     assert spread[is_large].median() / spread[~is_large].median() == pytest.approx(6, rel=0.25)
     assert spread[~is_large].median() == pytest.approx(0.1, rel=0.2)
     # 68 % of a Laplace distribution lie within 1.15 of its spread, 0.81 of its deviation
-    assert sigma_scale(doubt, other) == pytest.approx(0.81, rel=0.1)
+    assert sigma_scale(doubt, replace(other, own=judged)) == pytest.approx(0.81, rel=0.1)
 
 
 def test_the_map_is_read_as_its_pixels_are() -> None:
     torch.manual_seed(0)
     doubt = fit_doubt(made_up_errors(), seed=0)
     tokens, log_depth = torch.randn(2, 8, 3, 4), torch.randn(2, 6, 8)
-    whole = doubt(tokens, log_depth)
+    own, sine = torch.randn(2, 2, 6, 8).unbind()
+    whole = doubt(tokens, log_depth, own, sine)
     assert whole.shape == (2, 6, 8)
     seen = doubt.basis @ (tokens[1, :, 2, 1] - doubt.centre)
-    one = torch.cat([seen, doubt.scaled(relief(log_depth))[1, 5, 2]])
-    torch.testing.assert_close(whole[1, 5, 2], doubt.judge(one))
+    one = torch.cat([seen, doubt.scaled(features(log_depth, own, sine))[1, 5, 2]])
+    torch.testing.assert_close(whole[1, 5, 2], together(own[1, 5, 2], doubt.judge(one)))
 
 
-def test_relief_is_free_of_the_scale_of_a_frame() -> None:
-    log_depth = torch.randn(1, 6, 9)
-    torch.testing.assert_close(relief(log_depth + 0.7), relief(log_depth), atol=1e-4, rtol=1e-4)
+def test_what_is_read_is_free_of_the_scale_of_a_frame() -> None:
+    log_depth, own, sine = torch.randn(3, 1, 6, 9).unbind()
+    read = features(log_depth, own, sine)
+    torch.testing.assert_close(features(log_depth + 0.7, own + 0.3, sine), read, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(read[..., 12], sine)
     ramp = torch.linspace(-1, 1, 9)[None, None].expand(1, 6, 9)
-    torch.testing.assert_close(relief(ramp)[0, 0, :, 0], ramp[0, 0])
-    torch.testing.assert_close(relief(ramp)[..., 4], torch.full((1, 6, 9), 0.25))  # across
-    torch.testing.assert_close(relief(ramp)[..., 3], torch.zeros(1, 6, 9))  # down
+    read = features(ramp, ramp, sine)
+    torch.testing.assert_close(read[0, 0, :, 0], ramp[0, 0])
+    torch.testing.assert_close(read[..., 4], torch.full((1, 6, 9), 0.25))  # across
+    torch.testing.assert_close(read[..., 3], torch.zeros(1, 6, 9))  # down
+    torch.testing.assert_close(read[0, :, 2:-2, 11], ramp[0, :, 2:-2])  # a ramp is smooth
 
 
-def test_folds_share_no_place_and_nothing_mixed(settings: dict[str, Any]) -> None:
+def test_folds_share_no_place_and_try_nothing_mixed(settings: dict[str, Any]) -> None:
     planned = plan_caches(TrainConfig.from_dict(settings), Encoder(tiny_backbone()).key)
-    assert plan_folds(planned) == [Fold((1,), 0), Fold((0,), 1)]
-    twice = [*planned[:2], replace(planned[0], view=planned[0].view.model_copy())]
-    assert plan_folds(twice) == [Fold((1,), 0), Fold((0, 2), 1), Fold((1,), 2)]
-    mixed = planned[1].view.model_copy(update={"augment": AugmentConfig(mixed=0.1)})
-    with pytest.raises(ConfigError, match="two sources of different places whose views are not mixed"):
-        plan_folds([planned[0], replace(planned[1], view=mixed)])
+    everything, nothing = [0, 1, 2, 3], []
+    told = [
+        ([views.tolist() for views in fold.learnt], [views.tolist() for views in fold.left_out])
+        for fold in plan_folds(planned)
+    ]
+    # hall, loft, and hall again with others mixed in, which is learnt from where hall is not left out
+    assert told == [
+        ([nothing, everything, nothing], [everything, nothing, nothing]),
+        ([everything, nothing, everything], [nothing, everything, nothing]),
+    ]
+    of_down = replace(planned[1], teaches="down")
+    mixed = replace(planned[1], view=planned[1].view.model_copy(update={"augment": AugmentConfig(mixed=0.1)}))
+    for other in (of_down, mixed):
+        with pytest.raises(ConfigError, match="two places whose views are not mixed"):
+            plan_folds([planned[0], other])
 
 
-def test_too_few_sources_are_told_before_any_work(settings: dict[str, Any], tmp_path: Path) -> None:
+def test_places_are_left_out_a_third_at_a_time(settings: dict[str, Any], tmp_path: Path) -> None:
+    names = ("hall", "loft", "attic", "cellar")
+    for count, name in enumerate(names[2:], start=4):
+        make_place(tmp_path / "data" / name, count)
+    source = {**settings["sources"][0], "places": [{"name": name, "samples": 2} for name in names]}
+    planned = plan_caches(TrainConfig.from_dict({**settings, "sources": [source]}), "test")
+    folds = plan_folds(planned)
+    assert [{names[planned[0].keys[k].place] for k in fold.left_out[0]} for fold in folds] == [
+        {"hall", "cellar"}, {"loft"}, {"attic"}
+    ]  # fmt: skip
+    for fold in folds:
+        assert sorted([*fold.learnt[0], *fold.left_out[0]]) == list(range(8))
+
+
+def test_too_few_places_are_told_before_any_work(settings: dict[str, Any], tmp_path: Path) -> None:
     config = TrainConfig.from_dict({**settings, "sources": settings["sources"][:1]})
     with pytest.raises(ConfigError, match="'uncertainty'"):
         loop.train_depth(config, backbone=tiny_backbone())
@@ -112,7 +149,7 @@ def test_too_few_sources_are_told_before_any_work(settings: dict[str, Any], tmp_
 def test_a_head_with_a_doubt_is_made_judged_and_planned(settings: dict[str, Any]) -> None:
     config = TrainConfig.from_dict(settings)
     plan = plan_training(config, backbone=tiny_backbone())
-    assert plan.steps == 3 * 3 + 2 * (1 + 1)  # 12 views; each fold has the 4 of the other source
+    assert plan.steps == 3 * 3 + 2 * (1 + 2)  # 12 views; one fold has the 4 of loft, one the 8 of hall
     result = loop.train_depth(config, backbone=tiny_backbone())
     head, _ = load_head(result.output)
     assert isinstance(head.doubt, Doubt)
@@ -132,7 +169,9 @@ def outputs(head: Any) -> tuple[torch.Tensor, torch.Tensor]:
         return head(torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56))
 
 
-@pytest.mark.parametrize("stage", ["member 1 of 1", "without source 2", "uncertainty", "uncertainty without"])
+@pytest.mark.parametrize(
+    "stage", ["member 1 of 1", "without places, 2", "uncertainty", "uncertainty without"]
+)
 def test_interrupted_it_goes_on_to_the_same_bytes(
     settings: dict[str, Any], stage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,8 +186,8 @@ def test_interrupted_it_goes_on_to_the_same_bytes(
         loop.train_depth(config, progress=interrupt, backbone=tiny_backbone())
     epochs: list[int] = []
     real = loop._epoch
-    monkeypatch.setattr(loop, "_epoch", lambda *a: (epochs.append(a[5]), real(*a))[1])
+    monkeypatch.setattr(loop, "_epoch", lambda *a: (epochs.append(a[6]), real(*a))[1])
     again = loop.train_depth(config, backbone=tiny_backbone())
     assert again.output.read_bytes() == whole
-    assert epochs == {"member 1 of 1": [0, 0, 0, 1, 1, 2, 2], "without source 2": [2, 2]}.get(stage, [])
+    assert epochs == {"member 1 of 1": [0, 0, 0, 1, 1, 2, 2], "without places, 2": [2, 2]}.get(stage, [])
     assert not list(again.output.parent.glob("*.checkpoint"))

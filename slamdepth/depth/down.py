@@ -20,19 +20,20 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from slamdepth.depth.gravity_field import gravity_field
+from slamdepth.depth.head_layers import GRAVITY_CHANNELS
 from slamdepth.depth.turning import roll_rad
 from slamdepth.depth.vanishing import ManhattanFrame
 from slamdepth.geometry import so3_exp
 
 Array = NDArray[np.float64]
 
-FRAMES = 8
+FRAMES = 12
 """Manhattan frames whose axes are offered."""
 _SUPPORT_WEIGHT = 30.0  # log odds per share of the lines that run along a frame
 _USUAL = np.array([0.0, np.cos(np.radians(20.0)), np.sin(np.radians(20.0))])
 """Gravity in a camera that is held upright and looks a little down."""
 _AWAY_RAD = np.radians(45.0)  # a direction as much farther from it is e times as unlikely
-_SAME = np.cos(np.radians(15.0))
+_SAME = np.cos(np.radians(20.0))
 _ALIKE = np.cos(np.radians(25.0))
 _LOOKED_AT = 2
 _NOT_LIKELY = 0.01
@@ -44,7 +45,7 @@ class DownEstimate:
 
     Attributes:
         down: ``(3,)``, unit, in the camera's frame (x right, y down, z forward).
-        share: how much of the belief is in directions within 15 degrees of it, 0 to 1.
+        share: how much of the belief it is the mean of, 0 to 1.
     """
 
     down: Array
@@ -59,7 +60,7 @@ class DownScorer(nn.Module):
         self.drop = nn.Dropout2d(dropout)
         self.tokens = nn.Conv2d(width, dim, 1)
         self.around = nn.Conv2d(dim, dim, 3, padding=1)
-        self.field = nn.Conv2d(4, dim, 1)
+        self.field = nn.Conv2d(GRAVITY_CHANNELS, dim, 1)
         self.together = nn.Conv2d(dim, dim, 3, padding=1)
         self.out = nn.Linear(dim, 1)
 
@@ -111,6 +112,9 @@ def find_down(
 ) -> DownEstimate | None:
     """The likeliest direction of gravity; None where lines offer none.
 
+    It is the mean of the directions within 20 degrees of one, as much as is believed of each, where most
+    belief is: lines offer several that differ by a few degrees.
+
     The image is looked at as taken, and, where more than one direction is likely, turned as each of the two
     likeliest says: what lies on its side is known better once it stands.
 
@@ -129,8 +133,10 @@ def find_down(
         for down in likeliest:
             log_belief = log_belief + _scores(scorer, look(roll_rad(down)), offered)
     belief = _shares(log_belief)
-    best = int(belief.argmax())
-    return DownEstimate(offered[best], float(belief[offered @ offered[best] > _SAME].sum()))
+    around = offered @ offered.T > _SAME
+    best = around[int((around @ belief).argmax())]
+    down = belief[best] @ offered[best]
+    return DownEstimate(down / np.linalg.norm(down), float(belief[best].sum()))
 
 
 def _scores(scorer: DownScorer, look: Look, offered: Array) -> Array:

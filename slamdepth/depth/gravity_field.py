@@ -8,8 +8,6 @@ from torch import Tensor
 
 from slamdepth.depth.head_layers import FACTOR
 
-CHANNELS = 4
-
 
 def gravity_field(down: Tensor, focal_px: Tensor, rows: int, columns: int) -> Tensor:
     """``(B, 4, rows / 7, columns / 7)`` of views with square pixels and a centred principal point.

@@ -21,9 +21,9 @@ from torch.nn import functional as F
 
 from slamdepth.depth.doubt import Doubt
 from slamdepth.depth.down import DownScorer
-from slamdepth.depth.gravity_field import CHANNELS
 from slamdepth.depth.head_layers import (
     FACTOR,
+    GRAVITY_CHANNELS,
     USUAL_DEPTH_M,
     Level,
     Residual,
@@ -35,10 +35,11 @@ from slamdepth.errors import WeightsError
 
 UPSAMPLING = "weights."
 """Prefix of the parameters that only the upsampling to full resolution uses."""
-FORMAT = "slamdepth-depth-head-4"
-_READABLE = ("slamdepth-depth-head-1", "slamdepth-depth-head-2", "slamdepth-depth-head-3", FORMAT)
+FORMAT = "slamdepth-depth-head-5"
+_EARLIER = tuple(f"slamdepth-depth-head-{number}" for number in range(1, 5))
 """The first format had no ``doubt``, the second no ``level_dim`` and no ``input_px``, the third no
-``gravity`` and no ``down_dim``."""
+``gravity`` and no ``down_dim``; up to the fourth the level read class tokens too, and a doubt not what the
+head says itself, so that such parts can no longer be read."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class HeadShape:
         dim, blocks, guide_dim: channels and residual convolutions, see ``HeadConfig``.
         members: heads whose predictions are averaged.
         doubt: components of the tokens read by :class:`~slamdepth.depth.doubt.Doubt`, which then
-            says how sure they are; 0 where the members themselves do.
+            says with them how sure they are; 0 where the members alone do.
         level_dim: channels of the branch that tells a view's mean log depth apart from its relief;
             0 where one branch tells both.
         input_px: rows times columns of the images it learnt from, and is given.
@@ -78,7 +79,7 @@ class DepthHead(nn.Module):
 
     With ``level_dim`` relief and level are told apart: relief, of mean 0, by tokens less their mean
     over the view, so that it cannot know a place by what is common to its tokens; the level by those
-    means and the class tokens. With ``gravity`` both are told how far below the horizon they look.
+    means. With ``gravity`` both are told how far below the horizon they look.
 
     Raises:
         ValueError: ``gravity`` without ``level_dim``.
@@ -101,7 +102,7 @@ class DepthHead(nn.Module):
         self.weights = nn.Conv2d(shape.guide_dim, 9 * FACTOR * FACTOR, 1)
         nn.init.normal_(self.out.weight, std=1e-3)
         self.out.bias = nn.Parameter(torch.tensor([math.log(USUAL_DEPTH_M), math.log(0.3)]))
-        self.field = zeroed(nn.Conv2d(CHANNELS, shape.dim, 1)) if shape.gravity else None
+        self.field = zeroed(nn.Conv2d(GRAVITY_CHANNELS, shape.dim, 1)) if shape.gravity else None
 
     def coarse(
         self, tokens: Tensor, class_tokens: Tensor, image: Tensor, field: Tensor | None = None
@@ -113,16 +114,17 @@ class DepthHead(nn.Module):
         """
         if field is None:
             rows, columns = image.shape[2] // FACTOR, image.shape[3] // FACTOR
-            field = image.new_zeros(len(image), CHANNELS, rows, columns)
-        x, cls = tokens.flatten(1, 2), class_tokens.flatten(1)
+            field = image.new_zeros(len(image), GRAVITY_CHANNELS, rows, columns)
+        x = tokens.flatten(1, 2)
         level = None
         if self.level is not None:
             mean = x.mean(dim=(2, 3))
-            level = self.level(cls, mean, field.mean(dim=(2, 3)))
+            level = self.level(mean, field.mean(dim=(2, 3)))
             x = x - mean[..., None, None]
         x = self.tokens(self.drop(x))
         if self.class_tokens is not None:
-            x = x + self.class_tokens(self.drop(cls[..., None, None])[..., 0, 0])[..., None, None]
+            cls = self.drop(class_tokens.flatten(1)[..., None, None])[..., 0, 0]
+            x = x + self.class_tokens(cls)[..., None, None]
         if self.field is not None:
             x = x + self.field(F.avg_pool2d(field, 2))
         x = F.gelu(x)
@@ -152,7 +154,7 @@ class DepthHead(nn.Module):
 class HeadEnsemble(nn.Module):
     """Heads that learnt from different seeds or sources, averaged.
 
-    Sigma is their geometric mean, or what a :class:`~slamdepth.depth.doubt.Doubt` says where the
+    Sigma is their geometric mean, averaged with what a :class:`~slamdepth.depth.doubt.Doubt` says where the
     shape has one. What they disagree on adds nothing: heads that know different things differ
     most in the scale of a whole image, which says nothing of its pixels, and the order of pixels
     by certainty got worse with it.
@@ -178,8 +180,9 @@ class HeadEnsemble(nn.Module):
         members = cast("list[DepthHead]", list(self.members))
         told = [member.coarse(tokens, class_tokens, image, field) for member in members]
         if self.doubt is not None:
-            log_depth = torch.stack([coarse[:, 0] for coarse, _ in told]).mean(dim=0)
-            doubt = self.doubt(tokens[:, -1], log_depth)
+            log_depth, own = torch.stack([coarse for coarse, _ in told]).mean(dim=0).unbind(dim=1)
+            sine = torch.zeros_like(own) if field is None else field[:, 0]
+            doubt = self.doubt(tokens[:, -1], log_depth, own, sine)
             told = [(torch.stack([coarse[:, 0], doubt], dim=1), features) for coarse, features in told]
         outs = torch.stack([
             convex_upsample(coarse, member.weights(features))
@@ -223,14 +226,19 @@ def load_head(path: Path, device: str = "cpu") -> tuple[HeadEnsemble, dict[str, 
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file: {error}") from error
-    if meta.get("format") not in _READABLE:
-        raise WeightsError(f"{path}: not a depth head of this package (format {meta.get('format')!r})")
+    if (kind := meta.get("format")) not in (FORMAT, *_EARLIER):
+        raise WeightsError(f"{path}: not a depth head of this package (format {kind!r})")
     try:
         values = json.loads(meta["shape"])
         shape = HeadShape(**{**values, "taps": tuple(values["taps"])})
         model = HeadEnsemble(shape, float(meta["sigma_scale"]))
     except (KeyError, TypeError, ValueError) as error:
         raise WeightsError(f"{path}: the header does not describe a depth head: {error}") from error
+    if kind != FORMAT and (shape.level_dim or shape.doubt):
+        raise WeightsError(
+            f"{path}: a head of an earlier version of slamdepth ({kind}), which told scale or uncertainty in "
+            f"another way; train it again with 'slamdepth train-depth'"
+        )
     check_layout(
         {name: tuple(value.shape) for name, value in tensors.items()},
         {name: tuple(value.shape) for name, value in model.state_dict().items()},

@@ -6,12 +6,14 @@ from __future__ import annotations
 import math
 from typing import TypeVar
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 FACTOR = 7
 """Pixels of the input a side of what the head predicts before the upsampling."""
+
+GRAVITY_CHANNELS = 4
+"""Of a gravity field, see :func:`~slamdepth.depth.gravity_field.gravity_field`."""
 
 USUAL_DEPTH_M = 1.8
 """What an untrained head predicts, at the canonical focal length."""
@@ -36,20 +38,24 @@ class Residual(nn.Module):
 
 
 class Level(nn.Module):
-    """A view's mean log depth ``(B,)`` from its class tokens and mean tokens ``(B, width)`` each and,
-    with ``gravity``, the mean ``(B, 4)`` of its gravity field."""
+    """A view's mean log depth ``(B,)`` from its mean tokens ``(B, width)`` and, with ``gravity``, the mean
+    ``(B, 4)`` of its gravity field.
+
+    The class tokens tell which place it is rather than how far things are: with them the level scatters
+    more in places not learnt from.
+    """
 
     def __init__(self, width: int, dim: int, gravity: bool = False) -> None:
         super().__init__()
         self.drop = nn.Dropout(_LEVEL_DROPOUT)
-        self.hidden = nn.Linear(2 * width, dim)
+        self.hidden = nn.Linear(width, dim)
         self.out = nn.Linear(dim, 1)
         nn.init.zeros_(self.out.weight)
         nn.init.constant_(self.out.bias, math.log(USUAL_DEPTH_M))
-        self.gravity = zeroed(nn.Linear(4, dim)) if gravity else None
+        self.gravity = zeroed(nn.Linear(GRAVITY_CHANNELS, dim)) if gravity else None
 
-    def forward(self, class_tokens: Tensor, mean_tokens: Tensor, mean_field: Tensor | None = None) -> Tensor:
-        hidden = self.hidden(self.drop(torch.cat([class_tokens, mean_tokens], dim=1)))
+    def forward(self, mean_tokens: Tensor, mean_field: Tensor | None = None) -> Tensor:
+        hidden = self.hidden(self.drop(F.layer_norm(mean_tokens, mean_tokens.shape[1:])))
         if self.gravity is not None and mean_field is not None:
             hidden = hidden + self.gravity(mean_field)
         return self.out(F.gelu(hidden))[:, 0]

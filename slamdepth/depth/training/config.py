@@ -168,7 +168,7 @@ class TrainConfig(_Section):
     )
     weight_decay: float = Field(0.05, ge=0)
     uncertainty: Literal["own", "out_of_fold"] = Field(
-        "own", description="each member's own, or learnt from errors in sources left out once each"
+        "own", description="each member's own, or that together with what errors in places left out teach"
     )
     sigma_scale: float = Field(
         1.0, gt=0,

@@ -21,17 +21,17 @@ from slamdepth.errors import ConfigError
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
-STEPS = 500
+STEPS = 2000
 _BATCH = 16
 _RATE = 2e-3
 _DECAY = 0.1
 _DROPOUT = 0.4
-_RIGHT_RAD = 0.15  # deviation of what is taken for right
-_ANYWHERE = 4
+_OFF = ((0.05, 2), (0.12, 4), (0.3, 5))  # deviation of directions about gravity, and how many
+_RIGHT_RAD = 0.1  # deviation of what is taken for right
 
 
-def wrong_directions(down: Array, rng: np.random.Generator) -> Array:
-    """Directions ``(20, 3)``: gravity itself, slightly off, up, horizontal ones as lines would offer them,
+def offered_directions(down: Array, rng: np.random.Generator) -> Array:
+    """Directions ``(22, 3)``: gravity itself, slightly off, up, horizontal ones as lines would offer them,
     some near gravity and some anywhere."""
     across = np.cross(down, rng.normal(size=3))
     across /= np.linalg.norm(across)
@@ -39,9 +39,9 @@ def wrong_directions(down: Array, rng: np.random.Generator) -> Array:
     angles = rng.uniform(0, 2 * np.pi, 5)[:, None]
     level = np.cos(angles) * across + np.sin(angles) * along
     frame = np.stack([level[0], np.cross(down, level[0])])
-    slightly, near = down + rng.normal(0, 0.06, (1, 3)), down + rng.normal(0, 0.35, (5, 3))
+    off = np.concatenate([down + rng.normal(0, deviation, (count, 3)) for deviation, count in _OFF])
     out = np.concatenate([
-        down[None], slightly, -down[None], frame, -frame, near, level[1:], rng.normal(size=(_ANYWHERE, 3))
+        down[None], off[:1], -down[None], frame, -frame, off[1:], level[1:4], rng.normal(size=(2, 3))
     ])  # fmt: skip
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
@@ -90,7 +90,7 @@ def _loss(
         cache = caches[c]
         rows, columns = cache.canonical_m.shape[1:]
         down = np.asarray(cache.down[k], dtype=np.float64)
-        offered = wrong_directions(down, rng)
+        offered = offered_directions(down, rng)
         focal_px = float(cache.focal_factor[k]) * CANONICAL_FOCAL_PX
         tokens.append(torch.from_numpy(np.asarray(cache.tokens[k])))
         fields.append(token_fields(torch.from_numpy(offered).float(), focal_px, rows, columns))

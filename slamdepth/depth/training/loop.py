@@ -12,12 +12,13 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from slamdepth.depth.checkpoints import check_device
@@ -77,7 +78,7 @@ def train_depth(
 
     Raises:
         ConfigError: a place is both trained on and held out, the device is not there, or there
-            are not two sources to learn uncertainty from.
+            are not two places to learn uncertainty from.
         DatasetError: a place is missing or malformed.
         WeightsError: the backbone is missing or damaged.
         OutputError: the output cannot be written.
@@ -108,7 +109,8 @@ def train_depth(
     history: list[EpochFigures] = []
     for member in range(config.members):
         training = of_member(planned, caches, member)
-        head, epochs = _train_member(config, training, judging, shape, member, key, device, progress)
+        views = [np.arange(len(cache)) for cache in training]
+        head, epochs = _train_member(config, training, views, judging, shape, member, key, device, progress)
         ensemble.members[member].load_state_dict(head.state_dict())
         history += epochs
     if ensemble.down is not None:
@@ -118,9 +120,9 @@ def train_depth(
     ensemble.sigma_scale = config.sigma_scale
     if folds:
 
-        def of_fold(number: int, training: list[FeatureCache]) -> DepthHead:
+        def of_fold(number: int, learnt: tuple[NDArray[np.int64], ...]) -> DepthHead:
             alone, place = config.model_copy(update={"fine_epochs": 0}), config.members + number
-            return _train_member(alone, training, [], shape, place, key, device, progress)[0]
+            return _train_member(alone, caches, learnt, [], shape, place, key, device, progress)[0]
 
         doubt, ensemble.sigma_scale, unseen = learn_doubt(
             planned, caches, folds, of_fold, seed=config.seed, device=device, progress=progress
@@ -199,6 +201,7 @@ def _places(planned: list[PlannedCache]) -> tuple[dict[str, object], ...]:
 def _train_member(
     config: TrainConfig,
     caches: list[FeatureCache],
+    views: Sequence[NDArray[np.int64]],
     judging: list[FeatureCache],
     shape: HeadShape,
     member: int,
@@ -223,7 +226,7 @@ def _train_member(
         for epoch in range(len(history), config.coarse_epochs + config.fine_epochs):
             torch.manual_seed(seed + 1_000_003 * (epoch + 1))  # so that a resumed epoch drops the same
             start = time.perf_counter()
-            loss = _epoch(config, caches, head, optimiser, epoch, member, device, progress)
+            loss = _epoch(config, caches, views, head, optimiser, epoch, member, device, progress)
             seconds = time.perf_counter() - start
             is_fine = epoch >= config.coarse_epochs
             judged = (
@@ -243,6 +246,7 @@ def _train_member(
 def _epoch(
     config: TrainConfig,
     caches: list[FeatureCache],
+    views: Sequence[NDArray[np.int64]],
     head: DepthHead,
     optimiser: torch.optim.Optimizer,
     epoch: int,
@@ -254,15 +258,14 @@ def _epoch(
     is_fine = epoch >= config.coarse_epochs
     for name, parameter in head.named_parameters():  # more at full resolution only learns places by heart
         parameter.requires_grad_(not is_fine or name.startswith(UPSAMPLING))
-    samples = np.array([(c, k) for c, cache in enumerate(caches) for k in range(len(cache))])
+    samples = np.array([(c, k) for c, of_cache in enumerate(views) for k in of_cache])
     order = np.random.default_rng([_seed(config, member), epoch]).permutation(len(samples))
     steps = steps_per_epoch(config, len(samples))
     total = 0.0
     for step in range(steps):
         chosen = samples[np.sort(order[step * config.batch : (step + 1) * config.batch])]
         batch, teaches = load_mixed_batch(caches, chosen, device)
-        if config.head.gravity:
-            batch = not_always_told(batch, config.head.unknown_gravity)
+        batch = not_always_told(batch, config.head)
         prediction, target = predict(head, batch, is_fine)
         loss = total_loss(taught(prediction, target, teaches), target, config.loss)
         for group in optimiser.param_groups:
@@ -293,7 +296,7 @@ def _how_far(config: TrainConfig, member: int, epoch: int, step: int, steps: int
     epochs = config.coarse_epochs + config.fine_epochs
     detail = f"epoch {epoch + 1} of {epochs}, loss {loss:.4f}"
     left_out = member - config.members  # beyond the members are the heads without a source each
-    what = f"without source {left_out + 1}" if left_out >= 0 else f"member {member + 1} of {config.members}"
+    what = f"without places, {left_out + 1}" if left_out >= 0 else f"member {member + 1} of {config.members}"
     return TrainStep(what, done, total, detail)
 
 

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Uncertainty learnt from errors in places that the predicting head has not seen.
 
-Every source whose views are not mixed is left out once: a head learns from the other such
-sources, predicts the one left out, and what it gets wrong there, after the view's median is taken
-out, is what a :class:`~slamdepth.depth.doubt.Doubt` learns to foresee. How wrong a whole view is
-is divided out, so that it learns which pixels of a view are surer than others.
+Every place is left out once, a third of them at a time: a head learns from the others, predicts views of
+those left out that are not mixed, and what it gets wrong there, after the view's median is taken out, is
+what a :class:`~slamdepth.depth.doubt.Doubt` learns to foresee. How wrong a whole view is is divided out,
+so that it learns which pixels of a view are surer than others. (What was mixed into a view that a head
+learns from may be of a place left out.)
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from slamdepth.depth.doubt import Doubt, relief
+from slamdepth.depth.doubt import Doubt, features, together
 from slamdepth.depth.head import DepthHead
 from slamdepth.depth.training.caches import PlannedCache
 from slamdepth.depth.training.features import FeatureCache, load_batch
@@ -29,43 +31,48 @@ from slamdepth.errors import ConfigError, DatasetError
 logger = logging.getLogger(__name__)
 
 COMPONENTS = 16
+_FOLDS = 3
 _PIXELS = 96
 _FEWEST = 20
 _VIEWS_AT_ONCE = 10
-_STEPS, _BATCH, _RATE, _DECAY = 600, 4096, 3e-3, 1e-2
+_STEPS, _BATCH, _RATE, _DECAY = 300, 2048, 3e-3, 0.3
 _ONE_SIGMA = 0.6827
 
 
 @dataclass(frozen=True)
 class Fold:
-    """Indices of the planned caches that a head learns from, and of the one it is tried on."""
+    """Samples of each planned cache, ``(n,)`` indices, that a head learns from, and that it is tried on."""
 
-    learnt: tuple[int, ...]
-    left_out: int
+    learnt: tuple[NDArray[np.int64], ...]
+    left_out: tuple[NDArray[np.int64], ...]
 
 
 def plan_folds(planned: Sequence[PlannedCache]) -> list[Fold]:
-    """Each source with unmixed views left out once.
+    """Each place that has views that are not mixed left out once, in all that is made of it.
 
     Raises:
-        ConfigError: no source would be left to learn from.
+        ConfigError: there are not two such places.
     """
-    plain = [
-        k
-        for k, plan in enumerate(planned)
-        if plan.held_out is None and plan.teaches != "down" and not plan.view.augment.mixed
-    ]
-    places = [{place.fingerprint for place in plan.places} for plan in planned]
-    folds = []
-    for left_out in plain:
-        learnt = tuple(k for k in plain if not places[k] & places[left_out])
-        if learnt:
-            folds.append(Fold(learnt, left_out))
-    if len(folds) < 2:
+    teaching = [plan.held_out is None and plan.teaches != "down" for plan in planned]
+    plain = [is_one and not plan.view.augment.mixed for plan, is_one in zip(planned, teaching, strict=True)]
+    number: dict[str, int] = {}
+    for plan, is_one in zip(planned, plain, strict=True):
+        for place in plan.places if is_one else ():
+            number.setdefault(place.fingerprint, len(number))
+    if len(number) < 2:
         raise ConfigError(
-            "setting 'uncertainty': out_of_fold needs two sources of different places whose views are not "
-            "mixed; each is left out once"
+            "setting 'uncertainty': out_of_fold needs two places whose views are not mixed; each is left out "
+            "once"
         )
+    folds = []
+    for fold in range(min(_FOLDS, len(number))):
+        learnt, left_out = [], []
+        for plan, is_teaching, is_plain in zip(planned, teaching, plain, strict=True):
+            of_place = [number.get(place.fingerprint, math.inf) % _FOLDS == fold for place in plan.places]
+            is_out = np.array([of_place[key.place] for key in plan.keys], dtype=bool)
+            learnt.append(np.flatnonzero(~is_out & is_teaching))
+            left_out.append(np.flatnonzero(is_out & is_plain))
+        folds.append(Fold(tuple(learnt), tuple(left_out)))
     return folds
 
 
@@ -75,16 +82,16 @@ class Errors:
 
     Attributes:
         tokens: ``(N, dim)`` float16, of the last tap.
-        relief: ``(N, RELIEF)``.
+        features: ``(N, FEATURES)``.
         error: ``(N,)`` size of the log error, after the view's median.
         share: ``(N,)`` the same over the view's mean.
         own: ``(N,)`` log spread that the predicting head tells itself.
-        place: ``(N,)`` counted over all sources.
+        place: ``(N,)`` counted over all that were left out.
         view: ``(N,)``.
     """
 
     tokens: Tensor
-    relief: Tensor
+    features: Tensor
     error: Tensor
     share: Tensor
     own: Tensor
@@ -95,20 +102,29 @@ class Errors:
 _FIELDS = tuple(Errors.__dataclass_fields__)
 
 
-def errors_of(head: DepthHead, cache: FeatureCache, seed: Sequence[int], device: str) -> Errors:
-    """Up to ``_PIXELS`` random pixels of each view of ``cache`` at 1/7 of the resolution.
+def errors_of(
+    head: DepthHead,
+    cache: FeatureCache,
+    views: NDArray[np.int64],
+    numbers: Sequence[int],
+    seed: Sequence[int],
+    device: str,
+) -> Errors | None:
+    """Up to ``_PIXELS`` random pixels of each of ``views (n,)`` of ``cache`` at 1/7 of the resolution; None
+    where no view has enough depth.
 
-    Raises:
-        DatasetError: no view has depth.
+    Args:
+        numbers: what the cache's places count as.
     """
     rng = np.random.default_rng(list(seed))
     parts: list[tuple[Tensor, ...]] = []
-    for start in range(0, len(cache), _VIEWS_AT_ONCE):
-        chosen = np.arange(start, min(start + _VIEWS_AT_ONCE, len(cache)))
+    for start in range(0, len(views), _VIEWS_AT_ONCE):
+        chosen = views[start : start + _VIEWS_AT_ONCE]
         tokens, class_tokens, image, field, depth = load_batch(cache, chosen, device)
         with torch.inference_mode():
             log_depth, own = head.coarse(tokens, class_tokens, image, field)[0].cpu().unbind(dim=1)
-        target, last, shapes = coarse_target(depth).cpu(), tokens[:, -1].cpu(), relief(log_depth)
+        target, last = coarse_target(depth).cpu(), tokens[:, -1].cpu()
+        read = features(log_depth, own, field[:, 0].cpu())
         for k, view in enumerate(chosen):
             known = torch.nonzero(target[k] > 0)
             if len(known) < _FEWEST:
@@ -118,28 +134,27 @@ def errors_of(head: DepthHead, cache: FeatureCache, seed: Sequence[int], device:
             some = torch.from_numpy(rng.choice(len(known), min(_PIXELS, len(known)), replace=False))
             row, column = known[some].unbind(dim=1)
             parts.append((
-                last[k][:, row // 2, column // 2].T.half(), shapes[k][row, column], error[some],
+                last[k][:, row // 2, column // 2].T.half(), read[k][row, column], error[some],
                 error[some] / error.mean().clamp_min(1e-6), own[k][row, column],
-                torch.full((len(some),), int(cache.place[view])), torch.full((len(some),), int(view)),
+                torch.full((len(some),), numbers[int(cache.place[view])]),
+                torch.full((len(some),), int(view)),
             ))  # fmt: skip
-    if not parts:
-        raise DatasetError("a source has no view with enough depth to learn an uncertainty from")
-    return Errors(*(torch.cat(part) for part in zip(*parts, strict=True)))
+    return Errors(*(torch.cat(part) for part in zip(*parts, strict=True))) if parts else None
 
 
 def join(parts: Sequence[Errors]) -> Errors:
-    """The errors of several folds, their places and views counted on."""
-    place = view = 0
+    """The errors of several caches and folds, their views counted on."""
+    view = 0
     moved = []
     for part in parts:
-        moved.append(replace(part, place=part.place + place, view=part.view + view))
-        place, view = place + int(part.place.max()) + 1, view + int(part.view.max()) + 1
+        moved.append(replace(part, view=part.view + view))
+        view += int(part.view.max()) + 1
     return Errors(*(torch.cat([getattr(part, name) for part in moved]) for name in _FIELDS))
 
 
 def fit_doubt(errors: Errors, seed: int, told: Callable[[int], None] = lambda _: None) -> Doubt:
     """Learn log spread by Laplace likelihood (Kendall and Gal 2017) of the errors' shares in a
-    view's mean error, times the mean of all.
+    view's mean error, times the mean of all. Each place counts the same.
 
     Args:
         told: called with the number of steps done, of ``_STEPS``.
@@ -152,16 +167,17 @@ def fit_doubt(errors: Errors, seed: int, told: Callable[[int], None] = lambda _:
         variance, axes = torch.linalg.eigh(torch.cov(tokens.T))
         most = torch.arange(len(variance) - 1, len(variance) - 1 - len(doubt.basis), -1)
         doubt.basis.copy_((axes[:, most] / variance[most].clamp_min(1e-6).sqrt()).T)
-        doubt.offset.copy_(errors.relief.mean(dim=0))
-        doubt.gain.copy_(1 / errors.relief.std(dim=0).clamp_min(1e-4))
-        features = features_of(doubt, errors)
+        doubt.offset.copy_(errors.features.mean(dim=0))
+        doubt.gain.copy_(1 / errors.features.std(dim=0).clamp_min(1e-4))
+        read = read_by(doubt, errors)
         target = errors.share * errors.error.mean()
+        places = [torch.nonzero(errors.place == place)[:, 0] for place in errors.place.unique()]
         optimiser = torch.optim.AdamW(doubt.parameters(), lr=_RATE, weight_decay=_DECAY)
         for step in range(_STEPS):
             for group in optimiser.param_groups:
                 group["lr"] = _RATE * (1 - step / _STEPS)
-            some = torch.randint(len(target), (_BATCH,))
-            spread = doubt.judge(features[some])
+            some = torch.cat([of[torch.randint(len(of), (_BATCH // len(places),))] for of in places])
+            spread = doubt.judge(read[some])
             loss = (target[some] * (-spread).exp() + spread).mean()
             optimiser.zero_grad()
             loss.backward()
@@ -170,16 +186,21 @@ def fit_doubt(errors: Errors, seed: int, told: Callable[[int], None] = lambda _:
     return doubt.eval().requires_grad_(False)
 
 
-def features_of(doubt: Doubt, errors: Errors) -> Tensor:
-    """What ``doubt`` reads of each pixel, ``(N, components + RELIEF)``."""
+def read_by(doubt: Doubt, errors: Errors) -> Tensor:
+    """What ``doubt`` reads of each pixel, ``(N, components + FEATURES)``."""
     seen = (errors.tokens.float() - doubt.centre) @ doubt.basis.T
-    return torch.cat([seen, doubt.scaled(errors.relief)], dim=1)
+    return torch.cat([seen, doubt.scaled(errors.features)], dim=1)
+
+
+def spread_of(doubt: Doubt, errors: Errors) -> Tensor:
+    """Log spread ``(N,)`` that a head with ``doubt`` tells of each pixel."""
+    return together(errors.own, doubt.judge(read_by(doubt, errors)))
 
 
 def sigma_scale(doubt: Doubt, errors: Errors) -> float:
     """The factor that makes sigma cover 68 % of the errors after the view's median: the mean over
     places, each of which counts the same."""
-    ratio = errors.error / (math.sqrt(2.0) * doubt.judge(features_of(doubt, errors)).exp())
+    ratio = errors.error / (math.sqrt(2.0) * spread_of(doubt, errors).exp())
     places = [ratio[errors.place == place] for place in errors.place.unique()]
     return float(np.mean([np.quantile(of_place.numpy(), _ONE_SIGMA) for of_place in places]))
 
@@ -207,29 +228,39 @@ def learn_doubt(
     planned: Sequence[PlannedCache],
     caches: Sequence[FeatureCache],
     folds: Sequence[Fold],
-    train: Callable[[int, list[FeatureCache]], DepthHead],
+    train: Callable[[int, tuple[NDArray[np.int64], ...]], DepthHead],
     *,
     seed: int,
     device: str,
     progress: Progress,
 ) -> tuple[Doubt, float, dict[str, dict[str, float]]]:
-    """The whole way: heads without a source each, their errors on it, the doubt learnt from all.
+    """The whole way: heads without some places each, their errors there, the doubt learnt from all.
 
     Args:
-        train: makes the head of a fold, by number, from caches.
+        train: makes the head of a fold, by number, from the samples of each cache.
 
     Returns:
-        The doubt, the factor on its sigma, and by place :func:`surest_half` by a doubt that has
-        learnt nothing of that place (``out_of_fold``), by what the head that has not seen the
-        source tells itself (``own``), and by how far a pixel's depth is from the median (``relief``).
+        The doubt, the factor on its sigma, and by place :func:`surest_half` by what a head says with a
+        doubt that has learnt nothing of that place (``out_of_fold``), by what a head that has not seen the
+        place says alone (``own``), and by how far a pixel's depth is from the median (``relief``).
+
+    Raises:
+        DatasetError: no view has enough depth to learn from.
     """
-    parts, names = [], []
+    parts = []
+    names: list[str] = []
+    numbers = []  # of each cache's places
+    for plan in planned:
+        names += [place.name for place in plan.places if place.name not in names]
+        numbers.append([names.index(place.name) for place in plan.places])
     for number, fold in enumerate(folds):
-        head = train(number, [caches[k] for k in fold.learnt]).eval()
-        part = errors_of(head, caches[fold.left_out], [seed, number], device)
-        parts.append(part)
-        names += [place.name for place in planned[fold.left_out].places][: int(part.place.max()) + 1]
+        head = train(number, fold.learnt).eval()
+        for k, views in enumerate(fold.left_out):
+            if (part := errors_of(head, caches[k], views, numbers[k], [seed, number, k], device)) is not None:
+                parts.append(part)
         progress(TrainStep("errors in places left out", number + 1, len(folds)))
+    if not parts:
+        raise DatasetError("no view has enough depth to learn an uncertainty from")
     errors = join(parts)
     doubt = fit_doubt(errors, seed, lambda step: progress(TrainStep("uncertainty", step, _STEPS)))
     unseen: dict[str, dict[str, float]] = {}
@@ -237,9 +268,9 @@ def learn_doubt(
         mine = errors.place == place
         without, there = fit_doubt(of_places(errors, ~mine), seed), of_places(errors, mine)
         unseen[names[place]] = {
-            "out_of_fold": surest_half(without.judge(features_of(without, there)), there),
+            "out_of_fold": surest_half(spread_of(without, there), there),
             "own": surest_half(there.own, there),
-            "relief": surest_half(there.relief[:, 1], there),
+            "relief": surest_half(there.features[:, 1], there),
         }
         logger.info("surest half in %s, not learnt from: %s", names[place], unseen[names[place]])
         progress(TrainStep("uncertainty without a place", len(unseen), len(errors.place.unique())))

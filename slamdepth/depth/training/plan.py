@@ -13,9 +13,8 @@ import torch
 
 from slamdepth.depth.checkpoints import check_device
 from slamdepth.depth.dinov2 import DinoV2
-from slamdepth.depth.gravity_field import CHANNELS
 from slamdepth.depth.head import DepthHead, HeadShape
-from slamdepth.depth.head_layers import FACTOR
+from slamdepth.depth.head_layers import FACTOR, GRAVITY_CHANNELS
 from slamdepth.depth.preprocess import PATCH
 from slamdepth.depth.training.caches import Encoder, benchmarks_seen, of_member, open_encoder, plan_caches
 from slamdepth.depth.training.config import TrainConfig
@@ -111,7 +110,7 @@ def plan_training(
     )
     folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
     fold_steps = config.coarse_epochs * sum(
-        steps_per_epoch(config, sum(len(planned[k].keys) for k in fold.learnt)) for fold in folds
+        steps_per_epoch(config, sum(map(len, fold.learnt))) for fold in folds
     )
     features_s = training_s = None
     if backbone is not None:
@@ -131,12 +130,13 @@ def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:
 
 def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[float, float]:
     view, taps = config.view, config.head.taps
+    cells = view.rows // FACTOR, view.columns // FACTOR
     head = DepthHead(head_shape(config, dim), config.head.dropout).to(device).train()
     batch = (
         torch.zeros(config.batch, len(taps), dim, view.rows // patch, view.columns // patch, device=device),
         torch.zeros(config.batch, len(taps), dim, device=device),
         torch.zeros(config.batch, 3, view.rows, view.columns, device=device),
-        torch.zeros(config.batch, CHANNELS, view.rows // FACTOR, view.columns // FACTOR, device=device),
+        torch.zeros(config.batch, GRAVITY_CHANNELS, *cells, device=device),
         torch.ones(config.batch, view.rows, view.columns, device=device),
     )
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from slamdepth.depth.head import DepthHead
 from slamdepth.depth.head_layers import FACTOR
+from slamdepth.depth.training.config import HeadConfig
 
 FINE_COST = 5
 """A step at full resolution costs about so many at 1/7."""
@@ -25,10 +26,15 @@ def predict(head: DepthHead, batch: Batch, is_fine: bool) -> tuple[Tensor, Tenso
     return head.coarse(tokens, class_tokens, image, field)[0], coarse_target(target)
 
 
-def not_always_told(batch: Batch, share: float) -> Batch:
-    """``batch`` with the gravity fields of a random ``share`` of its samples zeroed: unknown."""
+def not_always_told(batch: Batch, config: HeadConfig) -> Batch:
+    """``batch`` with the gravity fields of a random share of its samples zeroed: unknown.
+
+    A head that is never told where down is gets it as it is.
+    """
+    if not config.gravity:
+        return batch
     tokens, class_tokens, image, field, target = batch
-    is_told = (torch.rand(len(field), 1, 1, 1) >= share).to(field)
+    is_told = (torch.rand(len(field), 1, 1, 1) >= config.unknown_gravity).to(field)
     return tokens, class_tokens, image, field * is_told, target
 
 
