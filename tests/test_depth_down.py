@@ -60,6 +60,17 @@ def test_a_frame_more_lines_run_along_wins() -> None:
     assert abs(found.down[1]) == pytest.approx(np.cos(0.5))
 
 
+def test_frames_that_nearly_agree_are_averaged() -> None:
+    support = np.array([0.2, 0.2, 0.2])
+    leaning = [ManhattanFrame(so3_exp(np.array([0.0, 0.0, angle])), support) for angle in (-0.12, 0.12)]
+    found = find_down(Likes(0.0), leaning, look_at())
+    assert found is not None
+    np.testing.assert_allclose(found.down, [0, 1, 0], atol=1e-6)
+    alone = find_down(Likes(0.0), leaning[:1], look_at())
+    assert alone is not None
+    assert abs(alone.down[0]) == pytest.approx(np.sin(0.12))
+
+
 def test_lines_that_offer_nothing_tell_nothing() -> None:
     assert find_down(Likes(1.0), [], look_at()) is None
 

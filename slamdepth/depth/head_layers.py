@@ -41,8 +41,8 @@ class Level(nn.Module):
     """A view's mean log depth ``(B,)`` from its mean tokens ``(B, width)`` and, with ``gravity``, the mean
     ``(B, 4)`` of its gravity field.
 
-    The class tokens tell which place it is rather than how far things are: with them the level scatters
-    more in places not learnt from.
+    Class tokens tell which place it is rather than how far things are: with them the scale of frames
+    scattered more in sequences not learnt from.
     """
 
     def __init__(self, width: int, dim: int, gravity: bool = False) -> None:

@@ -55,20 +55,20 @@ def plan_folds(planned: Sequence[PlannedCache]) -> list[Fold]:
     """
     teaching = [plan.held_out is None and plan.teaches != "down" for plan in planned]
     plain = [is_one and not plan.view.augment.mixed for plan, is_one in zip(planned, teaching, strict=True)]
-    number: dict[str, int] = {}
+    fold_of: dict[str, int] = {}
     for plan, is_one in zip(planned, plain, strict=True):
         for place in plan.places if is_one else ():
-            number.setdefault(place.fingerprint, len(number))
-    if len(number) < 2:
+            fold_of.setdefault(place.fingerprint, len(fold_of) % _FOLDS)
+    if len(fold_of) < 2:
         raise ConfigError(
             "setting 'uncertainty': out_of_fold needs two places whose views are not mixed; each is left out "
             "once"
         )
     folds = []
-    for fold in range(min(_FOLDS, len(number))):
+    for fold in range(min(_FOLDS, len(fold_of))):
         learnt, left_out = [], []
         for plan, is_teaching, is_plain in zip(planned, teaching, plain, strict=True):
-            of_place = [number.get(place.fingerprint, math.inf) % _FOLDS == fold for place in plan.places]
+            of_place = [fold_of.get(place.fingerprint) == fold for place in plan.places]
             is_out = np.array([of_place[key.place] for key in plan.keys], dtype=bool)
             learnt.append(np.flatnonzero(~is_out & is_teaching))
             left_out.append(np.flatnonzero(is_out & is_plain))
