@@ -59,6 +59,24 @@ def test_a_member_learns_from_its_sources_alone(
     assert seen == [(0, 8), (0, 8), (1, 8), (1, 8)]  # its own place and the common one
 
 
+def test_a_checkpoint_of_another_layout_of_heads_is_not_gone_on_with(
+    settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def kill(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as at_the_end:
+        at_the_end.setattr(loop, "save_head", kill)
+        with pytest.raises(KeyboardInterrupt):
+            train(settings)
+    epochs: list[int] = []
+    real = loop._epoch
+    monkeypatch.setattr(loop, "_epoch", lambda *a: (epochs.append(a[5]), real(*a))[1])
+    monkeypatch.setattr(loop, "FORMAT", "another")
+    train(settings)
+    assert epochs == [0, 1, 0, 1]  # of both members, from the start
+
+
 def test_a_member_without_a_place_is_an_error(settings: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="no place to train on for member 1"):
         train({**settings, "sources": settings["sources"][:1]})

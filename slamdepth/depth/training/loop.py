@@ -23,7 +23,7 @@ from torch import nn
 
 from slamdepth.depth.checkpoints import check_device
 from slamdepth.depth.dinov2 import DinoV2
-from slamdepth.depth.head import UPSAMPLING, DepthHead, HeadEnsemble, HeadShape, save_head
+from slamdepth.depth.head import FORMAT, UPSAMPLING, DepthHead, HeadEnsemble, HeadShape, save_head
 from slamdepth.depth.training.caches import (
     Encoder,
     PlannedCache,
@@ -104,7 +104,7 @@ def train_depth(
     judging = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None]
     dim = encoder.backbone.dim
     shape = head_shape(config, dim, doubt=min(COMPONENTS, dim) if folds else 0)
-    key = digest(config, [plan.folder.name for plan in planned])
+    key = digest(config, FORMAT, [plan.folder.name for plan in planned])
     ensemble = HeadEnsemble(shape)
     history: list[EpochFigures] = []
     for member in range(config.members):
@@ -295,7 +295,7 @@ def _how_far(config: TrainConfig, member: int, epoch: int, step: int, steps: int
     total = steps * (config.coarse_epochs + FINE_COST * config.fine_epochs)
     epochs = config.coarse_epochs + config.fine_epochs
     detail = f"epoch {epoch + 1} of {epochs}, loss {loss:.4f}"
-    left_out = member - config.members  # beyond the members are the heads without a source each
+    left_out = member - config.members  # beyond the members are the heads without some places each
     what = f"without places, {left_out + 1}" if left_out >= 0 else f"member {member + 1} of {config.members}"
     return TrainStep(what, done, total, detail)
 
