@@ -82,6 +82,8 @@ def vit_of(model: DepthModel) -> DinoV2:
         ConfigError: it has none, so there is nothing to cut.
     """
     for value in vars(model).values():
+        if isinstance(value, DepthModel):
+            return vit_of(value)
         if isinstance(value, nn.Module):
             for module in value.modules():
                 if isinstance(module, DinoV2):

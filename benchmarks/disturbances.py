@@ -92,12 +92,6 @@ def _lap_s(times_s: NDArray[np.float64]) -> float:
     return float(times_s[-1] - times_s[0]) * len(times_s) / max(len(times_s) - 1, 1)
 
 
-def mirrored_camera(camera: Camera) -> Camera:
-    """The camera that sees a mirrored world as ``camera`` sees the world, left and right exchanged."""
-    k1, k2, p1, p2, k3 = camera.distortion
-    return replace(camera, cx=camera.width - 1 - camera.cx, distortion=(k1, k2, p1, -p2, k3))
-
-
 def mirrored_truth(truth: Trajectory) -> Trajectory:
     """Poses in the world mirrored in x."""
     return Trajectory(truth.timestamps_s, _MIRROR @ truth.T_world_camera @ _MIRROR)
@@ -154,7 +148,7 @@ def _with_bar(image: NDArray[np.uint8], n: int) -> NDArray[np.uint8]:
 DISTURBANCES: dict[str, Disturbance] = {
     "as it is": Disturbance(),
     "mirrored": Disturbance(
-        camera=mirrored_camera, pixels=lambda pixels: pixels[:, ::-1], truth=mirrored_truth
+        camera=Camera.mirrored, pixels=lambda pixels: pixels[:, ::-1], truth=mirrored_truth
     ),
     "backwards": Disturbance(truth=backward_truth, backwards=True),
     "half the pixels": Disturbance(

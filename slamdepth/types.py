@@ -87,6 +87,12 @@ class Camera:
             cy=(self.cy + 0.5) * sy - 0.5,
         )
 
+    def mirrored(self) -> Camera:
+        """The camera whose images are those of this one, left and right exchanged: it sees a mirrored world
+        as this one sees the world."""
+        k1, k2, p1, p2, k3 = self.distortion
+        return replace(self, cx=self.width - 1 - self.cx, distortion=(k1, k2, p1, -p2, k3))
+
     def without_distortion(self) -> Camera:
         """The pinhole camera that undistorted pixels belong to."""
         return replace(self, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from made_up import MadeUpDataset, pose
 
-from benchmarks.disturbances import DISTURBANCES, mirrored_camera, mirrored_truth
+from benchmarks.disturbances import DISTURBANCES, mirrored_truth
 from benchmarks.disturbed import main
 from slamdepth.geometry import se3_exp
 from slamdepth.types import Camera, Trajectory
@@ -34,7 +34,7 @@ def test_a_mirrored_camera_sees_the_mirrored_world_as_its_image_shows_it() -> No
     mirrored = mirrored_truth(Trajectory(np.zeros(1), T[None])).T_world_camera[0]
     assert np.linalg.det(mirrored[:3, :3]) == pytest.approx(1.0)
     px = seen_px(CAMERA, T, points_w)
-    other = seen_px(mirrored_camera(CAMERA), mirrored, points_w * [-1, 1, 1])
+    other = seen_px(CAMERA.mirrored(), mirrored, points_w * [-1, 1, 1])
     np.testing.assert_allclose(other, np.stack([CAMERA.width - 1 - px[:, 0], px[:, 1]], axis=1), atol=1e-9)
 
 

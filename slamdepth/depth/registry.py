@@ -29,6 +29,7 @@ Factory = Callable[..., DepthModel]
 
 ENTRY_POINTS = "slamdepth.depth_models"
 _ONNX = "onnx:"
+_MIRRORED = "mirrored:"
 _DEPTH_ANYTHING = [
     f"depth-anything-v2-{size}{metric}"
     for size in ("small", "base", "large")
@@ -63,8 +64,10 @@ def register(name: str) -> Callable[[Factory], Factory]:
 
 
 def depth_model_names() -> list[str]:
-    """Every name :func:`create_depth_model` takes, the default first; ``onnx:FILE`` stands for any file."""
-    return [*_MODULES, f"{_ONNX}FILE", *sorted({*_factories, *_plugins()} - set(_MODULES))]
+    """Every name :func:`create_depth_model` takes, the default first; ``onnx:FILE`` stands for any file,
+    ``mirrored:MODEL`` for any of the others."""
+    others = sorted({*_factories, *_plugins()} - set(_MODULES))
+    return [*_MODULES, f"{_ONNX}FILE", *others, f"{_MIRRORED}MODEL"]
 
 
 def create_depth_model(
@@ -83,6 +86,11 @@ def create_depth_model(
             takes no weights file, or a plug-in is broken.
         WeightsError: its weights are missing, damaged or of another layout.
     """
+    if name.startswith(_MIRRORED):
+        from slamdepth.depth.mirrored import MirroredDepth
+
+        looked_through = name.removeprefix(_MIRRORED)
+        return MirroredDepth(create_depth_model(looked_through, device=device, seed=seed, weights=weights))
     if name.startswith(_ONNX):
         if weights is not None:
             raise ConfigError(f"depth model '{name}' names its file already; leave out the weights")
@@ -114,7 +122,7 @@ def _plugins() -> dict[str, list[EntryPoint]]:
 
     found: dict[str, list[EntryPoint]] = {}
     for point in entry_points(group=ENTRY_POINTS):
-        if point.name in _MODULES or point.name.startswith(_ONNX):
+        if point.name in _MODULES or point.name.startswith((_ONNX, _MIRRORED)):
             logger.warning("depth model '%s' of %s is ignored: the name is taken", point.name, point.value)
             continue
         found.setdefault(point.name, []).append(point)

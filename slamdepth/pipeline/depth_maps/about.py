@@ -23,7 +23,7 @@ def images(number: int) -> str:
 
 def public_name(model: DepthModel) -> str:
     """The model's name without the folders of this machine, for results are passed on."""
-    return re.sub(r":.*/", ":", model.name)
+    return re.sub(r":[^:]*/", ":", model.name)
 
 
 def intrinsics_entry(intrinsics: Intrinsics) -> dict[str, Any]:
