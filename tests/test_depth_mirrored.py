@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,3 +96,12 @@ def test_it_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
         create_depth_model("mirrored:right")
     with pytest.raises(ConfigError, match="a sensor's depth needs no mirror; use 'sensor'"):
         create_depth_model("mirrored:sensor")
+
+
+def test_its_card_is_that_of_the_model_it_looks_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    from slamdepth.depth.card import ModelCard, card_of
+
+    assert card_of(MirroredDepth(Left())) is None
+    card = ModelCard("left", DepthKind.METRIC, (3, 4), 5.0, "none", "nothing")
+    monkeypatch.setattr(Left, "card", card, raising=False)
+    assert card_of(MirroredDepth(Left())) == replace(card, name="mirrored:left")

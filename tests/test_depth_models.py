@@ -11,13 +11,15 @@ import torch
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.base import DepthModel
+from slamdepth.depth.card import ModelCard, card_of
 from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.evaluate import judge_depth
 from slamdepth.depth.head import HeadEnsemble, HeadShape
 from slamdepth.depth.model import Dinov2Depth
 from slamdepth.depth.registry import create_depth_model, depth_model_names
 from slamdepth.errors import CameraError, ConfigError, DatasetError, WeightsError
-from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
+from slamdepth.report.depth import model_lines
+from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
 
 
 def frame_of(width: int = 64, height: int = 48, *, focal: float = 60.0, depth: bool = True) -> Frame:
@@ -81,6 +83,18 @@ def test_prediction_is_deterministic_and_scales_with_the_focal_length() -> None:
     np.testing.assert_array_equal(first.values, again.values)
     longer = model.predict(frame_of(focal=120.0))
     np.testing.assert_allclose(longer.values, 2 * first.values, rtol=1e-5)
+
+
+def test_the_default_says_what_it_learnt_from() -> None:
+    head = WeightsInfo("head", "ab", "six places", "free")
+    model = Dinov2Depth(DinoV2(24, 2, 3, grid=5), HeadEnsemble(HeadShape((0, 1), 24, 16, 1, 8)), (head,))
+    assert model.card == ModelCard("dinov2", DepthKind.METRIC, (238, 322), 280.0, "free", "six places")
+    assert card_of(create_depth_model("sensor")) is None
+    assert model_lines(model) == [
+        "dinov2: metric depth; learnt from 238x322 pixels of focal length 280 px",
+        "weights head, sha256 ab; free; trained on six places",
+    ]
+    assert model_lines(create_depth_model("sensor")) == ["sensor: metric depth"]
 
 
 def test_prediction_refuses_slivers() -> None:

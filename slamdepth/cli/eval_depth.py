@@ -61,7 +61,7 @@ def eval_depth_command(
     from slamdepth.evaluation import Interval, mean_over_sets
     from slamdepth.pipeline.depth_data import open_depth_data, thinned
     from slamdepth.pipeline.folder import writable_file
-    from slamdepth.report.depth import judgement_lines, judgement_table
+    from slamdepth.report.depth import judgement_lines, judgement_table, model_lines
 
     if Path(model).is_dir():
         raise ConfigError(
@@ -73,6 +73,8 @@ def eval_depth_command(
     places = [place for path in data for place in open_depth_data(path, camera=camera)]
     network = create_depth_model(model, device=device, weights=depth_weights)
     out = console()
+    for line in model_lines(network):
+        out.print(line, markup=False, soft_wrap=True)
     judged: dict[str, DepthJudgement] = {}
     sheets: dict[str, list[SheetRow]] = {}
     for number, place in enumerate(places, 1):
@@ -134,6 +136,7 @@ def _write(
     """The JSON file and, beside it, a sheet a data set and one plot; names of the pictures."""
     from dataclasses import asdict
 
+    from slamdepth.depth.card import card_of
     from slamdepth.io import write_json
     from slamdepth.report.depth import WAY_NAMES, write_over_depth, write_sheet
     from slamdepth.report.environment import hardware, versions
@@ -144,6 +147,7 @@ def _write(
         {
             "depth_model": model.name,
             "kind": model.kind,
+            "card": None if (card := card_of(model)) is None else asdict(card),
             "weights": [asdict(info) for info in model.weights],
             "settings": settings,
             "versions": versions(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from slamdepth.depth.base import DepthModel
 from slamdepth.types import DepthKind
 
 
@@ -29,3 +30,9 @@ class ModelCard:
     native_focal_px: float | None
     licence: str
     trained_on: str
+
+
+def card_of(model: DepthModel) -> ModelCard | None:
+    """The card of a model; None for one without: a sensor learnt nothing, a plug-in need not have one."""
+    card = getattr(model, "card", None)
+    return card if isinstance(card, ModelCard) else None

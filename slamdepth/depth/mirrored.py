@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slamdepth.depth.base import DepthModel
+from slamdepth.depth.card import card_of
 from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind, DepthPrediction, Frame
 
@@ -33,6 +34,8 @@ class MirroredDepth:
         if model.name == "sensor":
             raise ConfigError("depth model 'mirrored:sensor': a sensor's depth needs no mirror; use 'sensor'")
         self.name, self.kind, self.weights = f"mirrored:{model.name}", model.kind, model.weights
+        card = card_of(model)
+        self.card = None if card is None else replace(card, name=self.name)
         self._model = model
 
     def predict(self, frame: Frame) -> DepthPrediction:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch.nn import functional as F
 
 from slamdepth.depth import weights as store
+from slamdepth.depth.card import ModelCard
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
 from slamdepth.depth.down import FRAMES, DownEstimate, Look, find_down
 from slamdepth.depth.gravity_field import gravity_field
@@ -89,6 +90,7 @@ class Dinov2Depth:
         device: str = "cpu",
     ) -> None:
         self.weights = weights
+        self.card = _card(head, weights)
         self.device = device
         self._dtype = working_type(device)
         self._backbone = backbone.to(device, self._dtype)
@@ -183,6 +185,13 @@ class Dinov2Depth:
             self.kind,
             np.ascontiguousarray(sigma_log, dtype=np.float32),
         )
+
+
+def _card(head: HeadEnsemble, weights: tuple[WeightsInfo, ...]) -> ModelCard:
+    """What the head learnt from; its training images are brought to one focal length."""
+    about = weights[-1] if weights else WeightsInfo("none", "", "unknown", "unknown")
+    size = input_size(3, 4, head.shape.input_px)
+    return ModelCard("dinov2", DepthKind.METRIC, size, CANONICAL_FOCAL_PX, about.licence, about.trained_on)
 
 
 @register("dinov2")

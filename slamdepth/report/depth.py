@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth.depth.base import DepthModel
+from slamdepth.depth.card import card_of
 from slamdepth.evaluation import DepthJudgement, Interval
 from slamdepth.report.figure import new_figure, write_png
 from slamdepth.report.pictures import UNKNOWN, near_to_far
@@ -77,6 +79,20 @@ def judgement_table(ways: Mapping[str, Mapping[str, Interval]], title: str) -> T
     for key, (name, digits) in _FIGURE_NAMES.items():
         table.add_row(Text(name), *(with_half(ways.get(way, {}).get(key), digits) for way in WAY_NAMES))
     return table
+
+
+def model_lines(model: DepthModel) -> list[str]:
+    """What a model says of itself: what its numbers mean, what it was trained on, and its files."""
+    card = card_of(model)
+    about = "" if card is None else f"; learnt from {card.native_size[0]}x{card.native_size[1]} pixels"
+    if card is not None and card.native_focal_px is not None:
+        about += f" of focal length {card.native_focal_px:.0f} px"
+    lines = [f"{model.name}: {model.kind.value}{about}"]
+    for info in model.weights:
+        lines.append(
+            f"weights {info.name}, sha256 {info.sha256}; {info.licence}; trained on {info.trained_on}"
+        )
+    return lines
 
 
 def judgement_lines(judgement: DepthJudgement) -> list[str]:

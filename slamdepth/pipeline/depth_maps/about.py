@@ -9,6 +9,7 @@ from typing import Any
 from slamdepth import __version__
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics
 from slamdepth.depth.base import DepthModel
+from slamdepth.depth.card import card_of
 from slamdepth.pipeline.depth_maps.folder import readme_head
 from slamdepth.pipeline.depth_maps.sources import Source
 from slamdepth.types import DepthKind
@@ -57,12 +58,15 @@ def about_folder(
         settings: what a later call must have in common.
     """
     is_metric = model.kind is DepthKind.METRIC
+    card = card_of(model)
     return {
         "slamdepth": __version__,
         "source": {"kind": source.kind.value, "name": source.name, "frames_per_second": source.fps},
         "model": {
             "name": public_name(model),
             "kind": model.kind.value,
+            "native_size": None if card is None else list(card.native_size),
+            "native_focal_px": None if card is None else card.native_focal_px,
             "weights": [
                 {"name": w.name, "sha256": w.sha256, "trained_on": w.trained_on, "licence": w.licence}
                 for w in model.weights
