@@ -118,13 +118,18 @@ class Finder:
         return None
 
     def _rescued(self, frame: Frame, features: Features) -> Placement | None:
-        """By registration of its depth: last, as the clouds of two places fit sooner than their features."""
+        """By registration of its depth: last, as the clouds of two places fit sooner than their features.
+
+        Not by what a network makes up of an image that shows nothing.
+        """
+        is_blank = len(features) < self._config.tracking.min_inliers
+        if is_blank and not self._depth.is_instant(frame):
+            return None
         if self._motion.last is not None:
             return self._register(frame, features, self._motion.guess(frame.timestamp_s))
         if not self._retry.is_due(
             has_depth=self._depth.has_depth(frame),
             is_instant=self._depth.is_instant(frame),
-            is_blank=len(features) == 0,
         ):
             return None
         return self._register(frame, features, self._retry.guess(), is_old=True)

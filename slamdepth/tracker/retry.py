@@ -42,17 +42,14 @@ class Retry:
         """Tell that another frame has come."""
         self._lost += 1
 
-    def is_due(self, *, has_depth: bool, is_instant: bool, is_blank: bool) -> bool:
+    def is_due(self, *, has_depth: bool, is_instant: bool) -> bool:
         """Whether this lost frame is to be tried.
 
         Args:
             has_depth: there is a depth to register.
             is_instant: it costs nothing, as a sensor's.
-            is_blank: the image shows nothing, so that a network's depth of it would be made up.
         """
         if not has_depth or self._T_camera_world is None or self._lost > _FRAMES:
-            return False
-        if not is_instant and is_blank:
             return False
         every = _EVERY if is_instant else _EVERY_PREDICTED
         if self._lost < self._tried + every:
