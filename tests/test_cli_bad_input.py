@@ -123,7 +123,7 @@ def test_a_sequence_that_shows_nothing(tiny_room: Path, tmp_path: Path) -> None:
 
 BAD_CALLS = {
     "missing folder": (("run", "/no/such/folder", "--depth", "sensor"), "/no/such/folder: no such folder"),
-    "a file": (("run", __file__, "--depth", "sensor"), "is a file; a sequence is a folder (of a video"),
+    "a file": (("run", __file__, "--depth", "sensor"), "is a file; a sequence is a folder or a video (mp4, "),
     "no sequence": (("run",), "Missing argument 'SEQ'"),
     "unknown option": (("run", "SEQ", "--dept", "sensor"), "No such option: --dept"),
     "unknown command": (("rum", "SEQ"), "No such command 'rum'"),

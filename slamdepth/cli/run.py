@@ -27,7 +27,8 @@ _PLACES = {
 
 def run_command(
     sequence: Annotated[
-        Path, typer.Argument(metavar="SEQ", help="Folder of a sequence: TUM layout or 7-Scenes.")
+        Path,
+        typer.Argument(metavar="SEQ", help="A video, or the folder of a sequence: TUM layout or 7-Scenes."),
     ],
     output: Annotated[
         Path | None,

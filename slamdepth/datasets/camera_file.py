@@ -63,6 +63,15 @@ def read_camera(path: str | Path) -> Camera:
         raise CameraError(f"{path}: {str(error).removeprefix('camera: ')}") from error
 
 
+def what_to_write(width: int, height: int) -> str:
+    """What a ``camera.yaml`` for images of this size has to hold, for a message."""
+    return (
+        f"the lines 'width: {width}', 'height: {height}', 'fx: ...', 'fy: ...', 'cx: ...', 'cy: ...' (pixels)"
+        " and, where they apply, 'distortion: [k1, k2, p1, p2, k3]', 'depth_factor: 5000' (raw depth units "
+        "per metre), 'fps: 30'"
+    )
+
+
 def write_camera(path: str | Path, camera: Camera) -> None:
     """Write ``camera`` so that :func:`read_camera` gives back an equal one.
 

@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 
 from slamdepth.datasets.base import Dataset
 from slamdepth.datasets.camera_file import read_camera
+from slamdepth.datasets.video import VIDEO_ENDINGS
 from slamdepth.errors import DatasetError
 from slamdepth.types import Camera
 
@@ -22,7 +23,7 @@ _log = logging.getLogger(__name__)
 
 
 class Reader(Protocol):
-    """Opens the folders of one layout.
+    """Opens the sequences of one layout.
 
     Attributes:
         name: short name of the layout.
@@ -33,11 +34,11 @@ class Reader(Protocol):
     needs: str
 
     def matches(self, path: Path) -> bool:
-        """True where the folder ``path`` is meant to have this layout, whole or not."""
+        """True where ``path``, a folder or file, is meant to have this layout, whole or not."""
         ...
 
     def open(self, path: Path, camera: Camera | None) -> Dataset:
-        """Open the folder; ``camera`` is what the user gave, or None.
+        """Open it; ``camera`` is what the user gave, or None.
 
         Raises:
             DatasetError: a file is missing or malformed.
@@ -69,26 +70,22 @@ def known_readers() -> tuple[Reader, ...]:
 
 
 def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dataset:
-    """Open the sequence in a folder, whatever its layout.
+    """Open a sequence, whatever its layout.
 
     Args:
-        path: the folder.
+        path: the folder, or a video file.
         camera_file: a ``camera.yaml`` that overrules what the folder says or is known for.
 
     Raises:
-        DatasetError: the folder is missing, of no known layout, or its files are
+        DatasetError: it is missing, of no known layout, or its files are
             missing or malformed; names file and line.
         CameraError: the intrinsics are malformed, unknown, or of another image size.
     """
     path = Path(path).expanduser()
     try:
         if not path.exists():
-            raise DatasetError(f"{path}: no such folder")
-        if not path.is_dir():
-            raise DatasetError(
-                f"{path}: is a file; a sequence is a folder (of a video: its frames and rgb.txt, "
-                "see 'Your own video' in the README)"
-            )
+            what = "video file" if path.suffix.lower() in VIDEO_ENDINGS else "folder"
+            raise DatasetError(f"{path}: no such {what}")
         camera = None if camera_file is None else read_camera(Path(camera_file).expanduser())
         readers = known_readers()
         for reader in readers:
@@ -100,5 +97,8 @@ def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dat
                 return dataset
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not path.is_dir():
+        known = ", ".join(ending.removeprefix(".") for ending in VIDEO_ENDINGS)
+        raise DatasetError(f"{path}: is a file; a sequence is a folder or a video ({known})")
     layouts = "; ".join(f"{reader.name} ({reader.needs})" for reader in readers)
     raise DatasetError(f"{path}: no known sequence layout; known are: {layouts}")

@@ -59,6 +59,26 @@ class VideoFile:
         self.fps = fps
         self.frames_named = round(named) if 0 < named < 1e9 else 0
 
+    def timestamps_s(self) -> NDArray[np.float64]:
+        """``(N,)`` times of all frames in seconds from the first; the video is decoded once for it.
+
+        A phone's frames do not come at equal intervals, so each says its own time. Where times do not
+        increase, they are counted by :attr:`fps`, with a note.
+        """
+        import cv2
+
+        capture, times_s = self._open(), []
+        try:
+            while capture.grab():
+                times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
+        finally:
+            capture.release()
+        told = np.array(times_s)
+        if len(told) > 1 and not (np.diff(told) > 0).all():
+            self.notes.append(f"the times of the video's frames do not increase; {self.fps:g} Hz is assumed")
+            return np.arange(len(told)) / self.fps
+        return told - told[0]
+
     def frames(self, stride: int = 1) -> Iterator[tuple[int, Callable[[], NDArray[np.uint8]]]]:
         """Every ``stride``-th frame: its number from 0, and a function that decodes it.
 

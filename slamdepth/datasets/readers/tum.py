@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.datasets.association import associate
-from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera
+from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera, what_to_write
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import (
     MAX_TIME_DIFFERENCE_S,
@@ -159,8 +159,6 @@ def _find_camera(path: Path, image_shape: tuple[int, ...], notes: list[str]) -> 
             return camera
     height, width = image_shape[:2]
     raise CameraError(
-        f"{path}: intrinsics are unknown: write {camera_path} or pass --camera FILE with the lines "
-        f"'width: {width}', 'height: {height}', 'fx: ...', 'fy: ...', 'cx: ...', 'cy: ...' (pixels) and, "
-        "where they apply, 'distortion: [k1, k2, p1, p2, k3]', 'depth_factor: 5000' (raw depth units per "
-        "metre), 'fps: 30'"
+        f"{path}: intrinsics are unknown: write {camera_path} or pass --camera FILE with "
+        f"{what_to_write(width, height)}"
     )

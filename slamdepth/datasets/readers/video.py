@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A video file as a sequence: no depth, no ground truth, and a camera that has to be named."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.datasets.camera_file import what_to_write
+from slamdepth.datasets.registry import register_reader
+from slamdepth.datasets.sequence import check_size
+from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
+from slamdepth.errors import CameraError, ImageDecodeError
+from slamdepth.types import Camera, Frame, Trajectory
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+LONGEST_SIDE_PX = 640
+"""Larger frames are reduced to it: what tracking is tuned to, and fast enough on a laptop."""
+
+
+@register_reader
+class VideoReader:
+    """Opens video files."""
+
+    name = "video"
+    needs = f"a file {', '.join(VIDEO_ENDINGS)}; its camera by --camera"
+
+    def matches(self, path: Path) -> bool:
+        return path.is_file() and path.suffix.lower() in VIDEO_ENDINGS
+
+    def open(self, path: Path, camera: Camera | None) -> VideoSequence:
+        video = VideoFile(path)
+        if camera is None:
+            # a camera.yaml that lies beside a video may be another's
+            raise CameraError(
+                f"{path}: the intrinsics of a video are unknown: pass --camera FILE, a camera.yaml with "
+                f"{what_to_write(video.width, video.height)}"
+            )
+        check_size(path, (video.height, video.width), camera)
+        return VideoSequence(video, camera)
+
+
+class VideoSequence:
+    """The :class:`~slamdepth.datasets.base.Dataset` of a video.
+
+    Frames are decoded in order, so reading forwards is fast; a step back starts from the first frame again.
+    Several threads may read, one at a time.
+
+    Args:
+        camera: for images of the video's own size.
+    """
+
+    has_depth = False
+    ground_truth: Trajectory | None = None
+
+    def __init__(self, video: VideoFile, camera: Camera) -> None:
+        self.name, self.path = video.path.stem, video.path
+        self.timestamps_s = video.timestamps_s()
+        self.notes = list(video.notes)
+        share = min(1.0, LONGEST_SIDE_PX / max(video.width, video.height))
+        width, height = round(share * video.width), round(share * video.height)
+        self.camera = replace(camera.scaled(width, height), fps=video.fps)
+        if share < 1.0:
+            self.notes.append(
+                f"frames of {video.width}x{video.height} are reduced to {width}x{height} pixels"
+            )
+        self._video = video
+        self._lock = threading.Lock()
+        self._frames = self._from_the_start()
+        self._next = 0
+
+    def __len__(self) -> int:
+        return len(self.timestamps_s)
+
+    def read(self, index: int, *, with_depth: bool = False) -> Frame:
+        """Read one frame; see :meth:`slamdepth.datasets.base.Dataset.read`.
+
+        Raises:
+            IndexError: ``index`` is not in 0 to ``len(self) - 1``.
+            ImageDecodeError: the frame does not decode.
+        """
+        del with_depth
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of {len(self)}")
+        with self._lock:
+            image_rgb = self._decoded(index)
+        return Frame(index, float(self.timestamps_s[index]), image_rgb, self.camera)
+
+    def _decoded(self, index: int) -> NDArray[np.uint8]:
+        import cv2
+
+        if index < self._next:
+            self._frames, self._next = self._from_the_start(), 0
+        for number, decode in self._frames:
+            self._next = number + 1
+            if number == index:
+                image = decode()
+                if image.shape[:2] == (self.camera.height, self.camera.width):
+                    return image
+                size = (self.camera.width, self.camera.height)
+                return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        raise ImageDecodeError(f"{self.path.name}: the video ends before frame {index}")
+
+    def _from_the_start(self) -> Iterator[tuple[int, Callable[[], NDArray[np.uint8]]]]:
+        return self._video.frames()

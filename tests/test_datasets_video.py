@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A video as a sequence."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from command_line import call
+from tracking_scene import ConstantDepth
+
+from slamdepth.datasets import Dataset, open_dataset, read_camera, write_camera
+from slamdepth.datasets.readers.video import VideoSequence
+from slamdepth.datasets.video import VideoFile
+from slamdepth.depth import registry
+from slamdepth.errors import CameraError, DatasetError
+from slamdepth.geometry import rotation_angle_rad
+from slamdepth.io import read_tum_trajectory
+from slamdepth.types import Camera
+
+COUNT = 12
+
+
+def film(path: Path, images_bgr: list[np.ndarray], fps: float = 10.0) -> Path:
+    size = (images_bgr[0].shape[1], images_bgr[0].shape[0])
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+    for image in images_bgr:
+        writer.write(image)
+    writer.release()
+    return path
+
+
+def grey_film(path: Path, width: int = 64, height: int = 48) -> Path:
+    return film(path, [np.full((height, width, 3), 20 * n, np.uint8) for n in range(COUNT)])
+
+
+def camera_file(path: Path, width: int = 64, height: int = 48) -> Path:
+    write_camera(path, Camera(width, height, 0.9 * width, 0.9 * width, (width - 1) / 2, (height - 1) / 2))
+    return path
+
+
+def opened(folder: Path, width: int = 64, height: int = 48) -> VideoSequence:
+    dataset = open_dataset(
+        grey_film(folder / "walk.mp4", width, height), camera_file(folder / "phone.yaml", width, height)
+    )
+    assert isinstance(dataset, VideoSequence)
+    return dataset
+
+
+def test_a_video_is_a_sequence_without_depth_and_truth(tmp_path: Path) -> None:
+    dataset = opened(tmp_path)
+    assert isinstance(dataset, Dataset)
+    assert (dataset.name, len(dataset), dataset.has_depth, dataset.ground_truth) == (
+        "walk",
+        COUNT,
+        False,
+        None,
+    )
+    assert dataset.notes == []
+    assert dataset.camera.fps == 10.0
+    np.testing.assert_allclose(dataset.timestamps_s, np.arange(COUNT) / 10, atol=1e-9)
+
+
+def test_frames_may_be_read_in_any_order_and_by_several_threads(tmp_path: Path) -> None:
+    dataset = opened(tmp_path)
+    order = [3, 4, 9, 2, 2, 0, COUNT - 1, 5]
+    with ThreadPoolExecutor(4) as pool:
+        frames = list(pool.map(lambda n: dataset.read(n, with_depth=True), order))
+    for n, frame in zip(order, frames, strict=True):
+        assert (frame.index, frame.timestamp_s, frame.depth_m) == (n, dataset.timestamps_s[n], None)
+        assert abs(float(frame.image_rgb.mean()) - 20 * n) < 4
+    with pytest.raises(IndexError, match=f"frame {COUNT} of {COUNT}"):
+        dataset.read(COUNT)
+
+
+@pytest.mark.parametrize(("width", "height", "reduced"), [(1280, 720, (640, 360)), (720, 1280, (360, 640))])
+def test_large_frames_are_reduced_with_their_camera(
+    tmp_path: Path, width: int, height: int, reduced: tuple[int, int]
+) -> None:
+    dataset = opened(tmp_path, width, height)
+    assert (dataset.camera.width, dataset.camera.height) == reduced
+    assert dataset.camera.fx == pytest.approx(0.9 * width / 2)
+    assert dataset.camera.cx == pytest.approx((reduced[0] - 1) / 2)
+    assert dataset.read(1).image_rgb.shape == (reduced[1], reduced[0], 3)
+    assert dataset.notes == [f"frames of {width}x{height} are reduced to {reduced[0]}x{reduced[1]} pixels"]
+
+
+def test_a_video_needs_its_camera(tmp_path: Path) -> None:
+    video = grey_film(tmp_path / "walk.mp4")
+    camera_file(tmp_path / "camera.yaml")  # of whatever else lies there
+    with pytest.raises(CameraError, match=r"walk.mp4: the intrinsics of a video are unknown.*'width: 64'"):
+        open_dataset(video)
+    with pytest.raises(CameraError, match="the image is 64x48, the camera says 128x96"):
+        open_dataset(video, camera_file(tmp_path / "other.yaml", 128, 96))
+
+
+def test_what_is_no_video(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"absent.mp4: no such video file"):
+        open_dataset(tmp_path / "absent.mp4")
+    damaged = tmp_path / "walk.mp4"
+    damaged.write_bytes(b"no video")
+    with pytest.raises(DatasetError, match="no video that can be read"):
+        open_dataset(damaged, camera_file(tmp_path / "phone.yaml"))
+    text = tmp_path / "walk.txt"
+    text.write_text("a walk", encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"is a file; a sequence is a folder or a video \(mp4, "):
+        open_dataset(text)
+
+
+@pytest.mark.parametrize(
+    ("told_ms", "expected_s", "notes"),
+    [
+        ([40.0, 73.0, 140.0], [0.0, 0.033, 0.1], 0),  # a phone's, at no equal intervals
+        ([0.0, 0.0, 0.0], [0.0, 0.1, 0.2], 1),
+        ([0.0, 50.0, 40.0], [0.0, 0.1, 0.2], 1),
+    ],
+)
+def test_each_frame_says_its_own_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told_ms: list[float], expected_s: list[float], notes: int
+) -> None:
+    class Capture:
+        def __init__(self) -> None:
+            self.at = -1
+
+        def grab(self) -> bool:
+            self.at += 1
+            return self.at < len(told_ms)
+
+        def get(self, what: int) -> float:
+            assert what == cv2.CAP_PROP_POS_MSEC
+            return told_ms[self.at]
+
+        def release(self) -> None:
+            pass
+
+    video = VideoFile(grey_film(tmp_path / "walk.mp4"))
+    monkeypatch.setattr(video, "_open", Capture)
+    np.testing.assert_allclose(video.timestamps_s(), expected_s)
+    assert len(video.notes) == notes
+
+
+def test_a_video_is_run_like_its_frames(
+    tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The trajectory of a film of the rendered room is about the one of its images."""
+
+    def flat(**_: Any) -> ConstantDepth:
+        return ConstantDepth()
+
+    monkeypatch.setitem(registry._factories, "constant", flat)
+    images = [cv2.imread(str(path)) for path in sorted((tiny_room / "rgb").iterdir())]
+    camera = read_camera(tiny_room / "camera.yaml")
+    video = film(tmp_path / "room.avi", images, camera.fps)
+    write_camera(tmp_path / "phone.yaml", camera)
+    turns = []
+    phone = ["--camera", tmp_path / "phone.yaml"]
+    for name, sequence, more in (("film", video, phone), ("frames", tiny_room, [])):
+        done = call("run", sequence, "--depth", "constant", "--no-mesh", "-q", "-o", tmp_path / name, *more)
+        assert done.returncode == 0, done.stderr
+        trajectory, _ = read_tum_trajectory(tmp_path / name / "trajectory.txt")
+        assert len(trajectory) == len(images)
+        turns.append(trajectory.T_world_camera[:, :3, :3])
+    assert rotation_angle_rad(turns[1]).max() > 0.1
+    assert rotation_angle_rad(np.swapaxes(turns[0], 1, 2) @ turns[1]).max() < 0.02
+    refused = call("run", video, "--depth", "sensor", "--camera", tmp_path / "phone.yaml")
+    assert refused.returncode == 2
+    assert "has no sensor depth" in refused.stderr
