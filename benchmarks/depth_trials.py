@@ -82,7 +82,7 @@ TRIALS: dict[str, Trial] = {
     "308 x 420 pixels": Trial({"view.rows": 308, "view.columns": 420}),
     "no dropout, little decay": Trial({"head.dropout": 0.0, "weight_decay": 0.05}),
     "last block only": Trial({"head.taps": (11,)}),
-    "real places only": Trial(is_real_only=True),
+    "real places only": Trial(is_real_only=True, all_teach_both=True),  # nothing else would teach relief
 }
 
 
