@@ -167,10 +167,10 @@ def make_plan(options: argparse.Namespace) -> Plan:
     Raises:
         InputError: a sequence, a system, a depth or a feature does not exist.
     """
-    from slamdepth.depth.registry import depth_model_names
+    from slamdepth.depth.registry import depth_model_names, is_depth_model_name
 
     for depth in options.depth:
-        if depth not in depth_model_names():
+        if not is_depth_model_name(depth):
             raise ConfigError(
                 f"--depth: no depth is called '{depth}'; known: {', '.join(depth_model_names())}"
             )

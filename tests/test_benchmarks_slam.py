@@ -123,6 +123,7 @@ def test_a_missing_peer_is_a_row_not_a_crash(
     [
         (("--systems", "slamdepth,vins"), "no system is called 'vins'; known: slamdepth, slamdepth-icp"),
         (("--depth", "lidar"), "no depth is called 'lidar'; known: "),
+        (("--depth", "mirrored:lidar"), "no depth is called 'mirrored:lidar'; known: "),
         (("--features", "orb,surf"), "no feature is called 'surf'; known: "),
         (("--features", "sift", "--ablation"), "--features: not together with --ablation"),
         (("--runs", 0), "--runs: at least 1"),

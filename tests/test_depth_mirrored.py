@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slamdepth.depth.mirrored import MirroredDepth, mirror_image
-from slamdepth.depth.registry import create_depth_model, depth_model_names
+from slamdepth.depth.registry import create_depth_model, depth_model_names, is_depth_model_name
 from slamdepth.errors import ConfigError
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
 
@@ -92,6 +92,8 @@ def test_it_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(model, MirroredDepth)
     assert (model.name, model.kind, model.weights) == ("mirrored:left", DepthKind.METRIC, Left.weights)
     assert "mirrored:MODEL" in depth_model_names()
+    names = ["dinov2", "mirrored:dinov2", "mirrored:onnx:net.onnx", "mirrored:right", "right"]
+    assert [is_depth_model_name(name) for name in names] == [True, True, True, False, False]
     with pytest.raises(ConfigError, match="unknown depth model 'right'; choose from: dinov2"):
         create_depth_model("mirrored:right")
     with pytest.raises(ConfigError, match="a sensor's depth needs no mirror; use 'sensor'"):

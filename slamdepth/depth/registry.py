@@ -70,6 +70,13 @@ def depth_model_names() -> list[str]:
     return [*_MODULES, f"{_ONNX}FILE", *others, f"{_MIRRORED}MODEL"]
 
 
+def is_depth_model_name(name: str) -> bool:
+    """Whether :func:`create_depth_model` takes ``name``; an ``onnx:`` file need not be there."""
+    if name.startswith(_MIRRORED):
+        return is_depth_model_name(name.removeprefix(_MIRRORED))
+    return name.startswith(_ONNX) or name in depth_model_names()
+
+
 def create_depth_model(
     name: str, *, device: str = "cpu", seed: int = 0, weights: str | Path | None = None
 ) -> DepthModel:
