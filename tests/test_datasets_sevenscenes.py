@@ -143,7 +143,7 @@ def test_real_kitchen(data_dir: Path) -> None:
 
 
 def test_readers_are_found_and_named_once() -> None:
-    assert [reader.name for reader in known_readers()] == ["7scenes", "tum"]
+    assert [reader.name for reader in known_readers()] == ["7scenes", "tum", "video"]
     assert all(reader.needs for reader in known_readers())
 
     class Twice:
