@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -73,7 +72,7 @@ class VideoSequence:
             )
         self._video = video
         self._lock = threading.Lock()
-        self._frames = self._from_the_start()
+        self._frames = video.frames()
         self._next = 0
 
     def __len__(self) -> int:
@@ -97,7 +96,7 @@ class VideoSequence:
         import cv2
 
         if index < self._next:
-            self._frames, self._next = self._from_the_start(), 0
+            self._frames, self._next = self._video.frames(), 0
         for number, decode in self._frames:
             self._next = number + 1
             if number == index:
@@ -107,6 +106,3 @@ class VideoSequence:
                 size = (self.camera.width, self.camera.height)
                 return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         raise ImageDecodeError(f"{self.path.name}: the video ends before frame {index}")
-
-    def _from_the_start(self) -> Iterator[tuple[int, Callable[[], NDArray[np.uint8]]]]:
-        return self._video.frames()
