@@ -19,8 +19,10 @@ from sequences import CAMERA, image_rgb, make_tum, write_image
 
 from slamdepth.datasets import write_camera
 from slamdepth.depth import registry
+from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import ConfigError, DatasetError, InputError, OutputError
 from slamdepth.pipeline.depth_maps import DepthMapOptions, DepthMapsInterrupted, make_depth_maps
+from slamdepth.pipeline.depth_maps.about import public_name
 from slamdepth.report.depth_map import coloured
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 
@@ -377,3 +379,17 @@ def test_ctrl_c_is_one_line_and_code_130(number: signal.Signals, tiny_room: Path
     assert stderr.count("\n") == 1
     done = [json.loads(line)["name"] for line in journal.read_text().splitlines()]
     assert len(list((out / "depth-metres").glob("*.npy"))) == len(done) > 3
+
+
+@pytest.mark.parametrize(
+    ("name", "public"),
+    [
+        ("mirrored:dinov2", "mirrored:dinov2"),
+        ("onnx:/home/a:b/net.onnx", "onnx:net.onnx"),
+        ("mirrored:onnx:/home/a:b/net.onnx", "mirrored:onnx:net.onnx"),
+    ],
+)
+def test_a_model_s_public_name_tells_no_folder(name: str, public: str) -> None:
+    model = SensorDepth()
+    model.name = name
+    assert public_name(model) == public

@@ -24,7 +24,7 @@ def images(number: int) -> str:
 
 def public_name(model: DepthModel) -> str:
     """The model's name without the folders of this machine, for results are passed on."""
-    return re.sub(r":[^:]*/", ":", model.name)
+    return re.sub(r":(?!onnx:).*/", ":", model.name)  # mirrored:onnx:FILE has two names before its path
 
 
 def intrinsics_entry(intrinsics: Intrinsics) -> dict[str, Any]:
