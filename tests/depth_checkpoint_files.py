@@ -5,11 +5,14 @@ not from our networks; and random files in them."""
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
+from slamdepth.depth import weights as store
 from slamdepth.depth.layout import dinov2_layout
 from slamdepth.types import Camera, Frame
 
@@ -79,3 +82,19 @@ def frame_of(width: int = 64, height: int = 48, focal: float = 60.0) -> Frame:
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
     return Frame(3, 0.1, image, Camera(width, height, focal, focal, width / 2, height / 2))
+
+
+def write_random_files(folder: Path, small: dict[str, Tensor]) -> None:
+    """Random files in the official layouts; ``small`` is Depth Anything's small one."""
+    torch.save(small, folder / "depth_anything_v2_vits.pth")
+    halves = {name: value.half() for name, value in small.items()}
+    save_file(halves, str(folder / "depth_anything_v2_metric_hypersim_vits.safetensors"))
+    vit = {k.removeprefix("pretrained."): v for k, v in halves.items() if k.startswith("pretrained.")}
+    torch.save(vit, folder / store.OFFICIAL_FILE)
+    for name, layout in (
+        ("nyu_linear4", linear_layout(4)),
+        ("kitti_linear", linear_layout(1)),
+        ("nyu_dpt", official_dpt_layout()),
+    ):
+        meta = {"meta": {"epoch": 1}, "state_dict": random_tensors(layout)}
+        torch.save(meta, folder / f"dinov2_vits14_{name}_head.pth")

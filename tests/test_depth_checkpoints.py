@@ -17,10 +17,10 @@ from depth_checkpoint_files import (
     linear_layout,
     official_dpt_layout,
     random_tensors,
+    write_random_files,
 )
 from hypothesis import given
 from hypothesis import strategies as st
-from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -49,18 +49,7 @@ def small_tensors() -> dict[str, Tensor]:
 def folder(tmp_path_factory: pytest.TempPathFactory, small_tensors: dict[str, Tensor]) -> Path:
     """A cache folder with random files in the official layouts, under the official names."""
     folder = tmp_path_factory.mktemp("cache")
-    torch.save(small_tensors, folder / "depth_anything_v2_vits.pth")
-    halves = {name: value.half() for name, value in small_tensors.items()}
-    save_file(halves, str(folder / "depth_anything_v2_metric_hypersim_vits.safetensors"))
-    vit = {k.removeprefix("pretrained."): v for k, v in halves.items() if k.startswith("pretrained.")}
-    torch.save(vit, folder / store.OFFICIAL_FILE)
-    for name, layout in (
-        ("nyu_linear4", linear_layout(4)),
-        ("kitti_linear", linear_layout(1)),
-        ("nyu_dpt", official_dpt_layout()),
-    ):
-        meta = {"meta": {"epoch": 1}, "state_dict": random_tensors(layout)}
-        torch.save(meta, folder / f"dinov2_vits14_{name}_head.pth")
+    write_random_files(folder, small_tensors)
     return folder
 
 
