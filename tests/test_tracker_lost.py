@@ -211,3 +211,21 @@ def test_a_place_that_looks_alike_is_asked_before_depth_is_registered(
     assert result.T_world_camera is not None
     np.testing.assert_allclose(result.T_world_camera, run.results[2].T_world_camera, atol=0.02)
     assert np.array_equal(tracker._motion.step, np.eye(4))
+
+
+@pytest.mark.parametrize(("kept", "is_believed"), [(30, False), (60, True)])
+def test_few_points_of_many_do_not_place_a_lost_camera(kept: int, is_believed: bool) -> None:
+    """Thirty of the hundreds of points that lie in a view also agree where it is not."""
+    run = Run(frames(range(40)))
+    localiser, features = run.tracker._localiser, run.tracker.prepare(frames([2])[0]).features
+    seen = localiser.from_keyframe(features, 0)
+    assert seen is not None
+    rng = np.random.default_rng(0)
+    chosen = rng.permutation(np.flatnonzero(seen.point_ids >= 0))[:kept]
+    descriptors = rng.integers(0, 256, features.descriptors.shape, dtype=np.uint8)
+    descriptors[chosen] = features.descriptors[chosen]
+    few = replace(features, descriptors=descriptors)
+    held = localiser.from_keyframe(few, 0)
+    assert held is not None
+    assert kept - 10 <= held.inliers <= kept + 5
+    assert (localiser.from_keyframe(few, 0, is_lost=True) is not None) is is_believed

@@ -111,7 +111,7 @@ class Finder:
             if k == tried:
                 continue
             placement = self._localiser.from_keyframe(
-                features, k, minimum=self._config.loops.min_inliers if k != newest else None
+                features, k, minimum=self._config.loops.min_inliers if k != newest else None, is_lost=True
             )
             if placement is not None:
                 return placement

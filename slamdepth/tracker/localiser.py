@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
 
 MAHALANOBIS_GATE = 9.21  # chi-square, 2 degrees of freedom, 99 %
+_FEWEST_SURE = 40
+_LEAST_SURE_SHARE = 0.07
 
 
 @dataclass(frozen=True)
@@ -174,8 +176,15 @@ class Localiser:
         self,
         features: Features,
         start: Placement,
+        *,
+        is_lost: bool = False,
     ) -> Placement | None:
-        """Search the whole neighbourhood of a first placement and place the frame by all of it."""
+        """Search the whole neighbourhood of a first placement and place the frame by all of it.
+
+        Args:
+            is_lost: nothing else says that the camera is there. In a wrong place few points agree, and few of
+                those that lie in the view.
+        """
         rows = self.local_rows(start.point_ids)
         visible = self.expected(start.T_camera_world, rows)
         found, at, _ = self.search(visible, features, 4.0, 30.0)
@@ -183,6 +192,9 @@ class Localiser:
             return None
         placement = self._solve(features, start.T_camera_world, found, at)
         if placement.inliers < self._config.tracking.min_inliers:
+            return None
+        share = placement.inliers / len(visible.rows)
+        if is_lost and placement.inliers < _FEWEST_SURE and share < _LEAST_SURE_SHARE:
             return None
         self._map.visible[visible.rows] += 1
         self._map.found[placement.point_ids[placement.point_ids >= 0]] += 1
@@ -232,9 +244,14 @@ class Localiser:
         return Placement(estimate.T_camera_world, point_ids)
 
     def from_keyframe(
-        self, features: Features, keyframe_id: int, *, minimum: int | None = None
+        self, features: Features, keyframe_id: int, *, minimum: int | None = None, is_lost: bool = False
     ) -> Placement | None:
-        """Place a frame by matching it with one keyframe, without knowing where it is."""
+        """Place a frame by matching it with one keyframe, without knowing where it is.
+
+        Args:
+            minimum: matches that are asked for; default: what tracking needs.
+            is_lost: see :meth:`refine_in_local_map`.
+        """
         need = self._config.tracking.min_inliers if minimum is None else minimum
         keyframe = self._map.keyframes[keyframe_id]
         has = np.flatnonzero(keyframe.point_ids >= 0)
@@ -255,4 +272,4 @@ class Localiser:
         start = self._solve(features, T, rows[inliers], b[inliers])
         if start.inliers < max(8, need // 2):
             return None
-        return self.refine_in_local_map(features, start)
+        return self.refine_in_local_map(features, start, is_lost=is_lost)
