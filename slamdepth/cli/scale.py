@@ -61,6 +61,7 @@ def scale_command(
     from slamdepth.errors import DatasetError
     from slamdepth.pipeline.folder import writable_file
     from slamdepth.pipeline.prediction_scale import read_with_depth
+    from slamdepth.pipeline.sequence_id import sequence_id
     from slamdepth.report import scale_table
 
     dataset = open_dataset(sequence, camera)
@@ -81,7 +82,9 @@ def scale_command(
             range(0, len(dataset), stride)[:max_frames],
             lambda done, total: bar.update(task, completed=done, total=total),
         )
-        fit = fit_scale(model, frames, with_shift=shift, sequence=dataset.name)
+        fit = fit_scale(
+            model, frames, with_shift=shift, sequence=dataset.name, sequence_id=sequence_id(dataset)
+        )
     out = console()
     out.print(scale_table(fit))
     if output is not None:

@@ -70,6 +70,7 @@ class ScaleFit:
 
     Attributes:
         sequence: its name.
+        sequence_id: a hash that tells it from others of that name; empty where it is not known.
         model, kind, weights: whose predictions were compared.
         scale_sigma_log: standard error of the natural log of ``scale.scale``; of one that
             was fitted with a shift, standard error of the log of depth at the median depth
@@ -90,6 +91,7 @@ class ScaleFit:
     frames: int
     pixels: int
     frame_spread_log: float
+    sequence_id: str = ""
 
 
 def needs_shift(kind: DepthKind) -> bool:
@@ -97,7 +99,9 @@ def needs_shift(kind: DepthKind) -> bool:
     return kind is not DepthKind.METRIC
 
 
-def fit_scale(model: DepthModel, frames: Iterable[Frame], *, with_shift: bool, sequence: str) -> ScaleFit:
+def fit_scale(
+    model: DepthModel, frames: Iterable[Frame], *, with_shift: bool, sequence: str, sequence_id: str = ""
+) -> ScaleFit:
     """Compare the model's predictions with the sensor's depth of ``frames``, in order of time.
 
     The scale alone is the median over frames of each frame's median ratio, so that a frame
@@ -133,6 +137,7 @@ def fit_scale(model: DepthModel, frames: Iterable[Frame], *, with_shift: bool, s
         frames=len(values),
         pixels=sum(map(len, values)),
         frame_spread_log=_frame_spread(scale, values, sensor_m),
+        sequence_id=sequence_id,
     )
 
 

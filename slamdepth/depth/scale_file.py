@@ -32,6 +32,7 @@ def write_scale(path: str | Path, fit: ScaleFit) -> None:
     values = {
         "format": FORMAT,
         "sequence": fit.sequence,
+        "sequence_id": fit.sequence_id,
         "depth_model": fit.model,
         "kind": fit.kind.value,
         "weights": [vars(info) for info in fit.weights],
@@ -117,6 +118,7 @@ def _parsed(values: dict[str, Any], origin: str) -> ScaleFit:
             frames=int(_number(rest, "frames", above=0.0)),
             pixels=int(_number(rest, "pixels", above=0.0)),
             frame_spread_log=_number(rest, "frame_spread_log"),
+            sequence_id=str(rest.pop("sequence_id", "")),
         )
     except KeyError as error:
         raise ConfigError(f"{origin}: the entry {error} is missing") from error

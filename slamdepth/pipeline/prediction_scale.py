@@ -20,6 +20,7 @@ from slamdepth.depth.scale_file import check_same_model, read_scale
 from slamdepth.depth.scaled import ScaledDepth
 from slamdepth.errors import ConfigError, DatasetError, ImageDecodeError
 from slamdepth.pipeline.options import RunInterrupted
+from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.report import ScaleSource
 from slamdepth.types import Frame
 
@@ -123,7 +124,13 @@ def choose_prediction_scale(
             return PredictionScale(ScaleSource.NETWORK, how, NETWORK_SIGMA_LOG, wants_trajectory=True)
         chosen = indices[:: -(-len(indices) // _FIT_FRAMES)]
         frames = read_with_depth(dataset, chosen, progress, stop)
-        fit = fit_scale(model, frames, with_shift=needs_shift(model.kind), sequence=dataset.name)
+        fit = fit_scale(
+            model,
+            frames,
+            with_shift=needs_shift(model.kind),
+            sequence=dataset.name,
+            sequence_id=sequence_id(dataset),
+        )
         how = (
             f"{_formula(name, fit.scale)}, fitted to {fit.frames} frames of this sequence's own depth sensor"
         )
@@ -134,7 +141,7 @@ def choose_prediction_scale(
         return PredictionScale(ScaleSource.VALUE, how, NETWORK_SIGMA_LOG, scale=scale)
     fit = read_scale(asked)
     check_same_model(fit, model, asked)
-    is_own = fit.sequence == dataset.name
+    is_own = fit.sequence_id == sequence_id(dataset)
     of = "this very sequence" if is_own else f"{fit.sequence}, another sequence"
     how = f"{_formula(name, fit.scale)}, from {Path(asked).name}, fitted to the depth sensor of {of}"
     return _of_fit(ScaleSource.FILE, fit, how, own=is_own)

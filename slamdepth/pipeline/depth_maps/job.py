@@ -106,8 +106,7 @@ def _settings(options: DepthMapOptions, source: Source, model: DepthModel) -> di
     return {
         "depth model": public_name(model),
         "weights": [info.sha256 for info in model.weights],
-        "source": f"{source.kind.value} {source.name}",
-        "source file": source.stamp,
+        "source": f"{source.kind.value} {source.name} ({source.stamp})",
         "camera": None if source.camera is None else asdict(source.camera),
         "stride": options.stride,
         "colour range": None if options.colour_range is None else list(options.colour_range),

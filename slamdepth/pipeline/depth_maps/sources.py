@@ -19,8 +19,10 @@ from slamdepth.datasets.intrinsics import Certainty, Intrinsics, find_camera_fil
 from slamdepth.datasets.pictures import IMAGE_ENDINGS, list_images, read_picture, short_names
 from slamdepth.datasets.sequence import check_size
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
+from slamdepth.depth.training.data import fingerprint
 from slamdepth.depth.training.readers.pairs import PairPlace, PairReader
 from slamdepth.errors import DatasetError, ImageDecodeError
+from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.types import Camera, Frame
 
 if TYPE_CHECKING:
@@ -64,7 +66,7 @@ class Source(Protocol):
         fps: shots per second, None where they are no film.
         camera: of all shots, where it is known and not only guessed.
         has_depth: True where frames may carry sensor depth.
-        stamp: changes when the file behind it changes; empty where each shot has its own.
+        stamp: differs for another source of the same name.
         notes: what was guessed or repaired, one line each.
     """
 
@@ -121,12 +123,12 @@ def open_source(
 class _PictureSource:
     fps: float | None = None
     has_depth = False
-    stamp = ""
 
     def __init__(self, kind: SourceKind, path: Path, images: list[Path], camera_file: Path | None) -> None:
         self.kind = kind
         self.notes: list[str] = []
         self.name = path.stem if kind is SourceKind.IMAGE else path.resolve().name
+        self.stamp = fingerprint((), str(path.resolve()))
         self._images = images
         self._given = find_camera_file(path.parent if kind is SourceKind.IMAGE else path, camera_file)
         self.camera = None if self._given is None else self._given[0]
@@ -182,10 +184,10 @@ class _PairSource:
     kind = SourceKind.PAIRS
     fps: float | None = None
     has_depth = True
-    stamp = ""
 
     def __init__(self, place: PairPlace, camera_file: Path | None, chosen: slice) -> None:
         self.name = place.name
+        self.stamp = place.fingerprint
         self.notes: list[str] = []
         self._place = place
         self._indices = range(len(place))[chosen]
@@ -211,10 +213,10 @@ class _PairSource:
 
 class _SequenceSource:
     kind = SourceKind.SEQUENCE
-    stamp = ""
 
     def __init__(self, dataset: Dataset, chosen: slice, with_depth: bool) -> None:
         self.name = dataset.name
+        self.stamp = sequence_id(dataset)
         self.notes = list(dataset.notes)
         self.camera: Camera | None = dataset.camera
         self.has_depth = dataset.has_depth
