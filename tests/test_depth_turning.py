@@ -59,3 +59,24 @@ def test_not_turned_is_the_same() -> None:
     back = turned_back(depth, prediction(np.ones((120, 160))), CAMERA, 0.0)
     np.testing.assert_array_equal(back.values, depth.values)
     assert back.sigma_log is None
+
+
+def test_there_is_no_step_where_the_turned_image_was_cut_off() -> None:
+    """The two differ by a factor that is not the same everywhere; what comes out follows it to the corners."""
+    u = np.arange(160) / 160
+    as_taken = np.full((120, 160), 2.0)
+    upright = as_taken * np.exp(0.3 + 0.2 * u)[None]
+    roll = 0.4
+    back = turned_back(prediction(upright), prediction(as_taken), CAMERA, roll).values
+    steps = np.maximum(np.abs(np.diff(np.log(back), axis=0))[:, 1:], np.abs(np.diff(np.log(back), axis=1))[1:])
+    assert steps.max() < 0.02
+    assert back[5, 5] == pytest.approx(2.0 * np.exp(0.3), rel=0.08)
+    assert back[5, 154] == pytest.approx(2.0 * np.exp(0.5), rel=0.08)
+
+
+def test_a_share_of_the_turned_one() -> None:
+    two, eight = np.full((120, 160), 2.0), np.full((120, 160), 8.0)
+    back = turned_back(prediction(eight, 0.2), prediction(two, 0.4), CAMERA, 0.1, 0.5)
+    np.testing.assert_allclose(back.values, 4.0, rtol=1e-6)
+    assert back.sigma_log is not None
+    assert back.sigma_log[60, 80] == pytest.approx(0.3)

@@ -34,7 +34,11 @@ from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 
 _TURN_RAD = math.radians(8.0)
-"""Images rolled by more than this are turned upright and seen again."""
+"""A look at an image turned by so much less or more serves to find out which way is down."""
+
+_LEVEL_RAD, _ROLLED_RAD = math.radians(4.0), math.radians(12.0)
+"""An image rolled by less counts as it was taken, one rolled by more as it is turned upright; between them
+the one goes over into the other, so that the depth of a video does not jump."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +58,11 @@ class _Looks:
         self._see, self.as_taken = see, see(frame, 0.0)
         self._seen = [self.as_taken]
 
-    def at(self, roll: float) -> _Seen:
-        """A look in which a camera of this roll is upright to 8 degrees."""
+    def at(self, roll: float, within_rad: float = _TURN_RAD) -> _Seen:
+        """A look in which a camera of this roll is upright to ``within_rad``."""
         for seen in self._seen:
             apart = roll - seen.look.turn_rad
-            if abs(math.atan2(math.sin(apart), math.cos(apart))) < _TURN_RAD:
+            if abs(math.atan2(math.sin(apart), math.cos(apart))) < within_rad:
                 return seen
         frame = self.as_taken.frame
         image = turned(frame.image_rgb, frame.camera, -roll)
@@ -158,10 +162,14 @@ class Dinov2Depth:
     def _upright(self, looks: _Looks, down: NDArray[np.float64] | None) -> DepthPrediction:
         """The prediction of the look in which the camera is upright, given ``down (3,)`` as taken."""
         as_taken = self._told(looks.as_taken, down)
-        if down is None or (upright := looks.at(roll_rad(down))) is looks.as_taken:
+        if down is None:
+            return as_taken
+        roll = roll_rad(down)
+        if (upright := looks.at(roll, _LEVEL_RAD)) is looks.as_taken:
             return as_taken
         told = self._told(upright, upright.look.seen(down))
-        return turned_back(told, as_taken, upright.frame.camera, upright.look.turn_rad)
+        share = min(1.0, (abs(roll) - _LEVEL_RAD) / (_ROLLED_RAD - _LEVEL_RAD))
+        return turned_back(told, as_taken, upright.frame.camera, upright.look.turn_rad, share)
 
     def _told(self, seen: _Seen, down: NDArray[np.float64] | None) -> DepthPrediction:
         """The head's prediction, told that gravity points ``down (3,)`` in what was seen."""
