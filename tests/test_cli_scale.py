@@ -84,7 +84,11 @@ def test_a_scale_is_fitted_kept_and_applied(tiny_room: Path, tmp_path: Path) -> 
 def test_ground_truth_depth_is_fitted_first(tiny_room: Path, tmp_path: Path) -> None:
     report = run(tiny_room, tmp_path / "run", "--depth-scale", "groundtruth")
     assert report["scale"]["source"] == "groundtruth-depth"
-    assert read_scale(tmp_path / "run" / "depth_scale.yaml").scale.scale == report["scale"]["factor"]
+    fitted = read_scale(tmp_path / "run" / "depth_scale.yaml").scale.scale
+    assert fitted == report["scale"]["prediction_factor"]
+    assert report["scale"]["factor"] == pytest.approx(fitted, rel=0.1)
+    assert "the map was multiplied by" in report["scale"]["sentence"]
+    assert report["ate"]["sim3"]["scale"] == pytest.approx(1.0, abs=0.02)
     assert "depth_scale.yaml" in (tmp_path / "run" / "report.html").read_text()
 
 

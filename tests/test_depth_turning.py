@@ -62,13 +62,15 @@ def test_not_turned_is_the_same() -> None:
 
 
 def test_there_is_no_step_where_the_turned_image_was_cut_off() -> None:
-    """The two differ by a factor that is not the same everywhere; what comes out follows it to the corners."""
+    """The two differ by a factor that grows to the right; what comes out follows it to the corners."""
     u = np.arange(160) / 160
     as_taken = np.full((120, 160), 2.0)
     upright = as_taken * np.exp(0.3 + 0.2 * u)[None]
     roll = 0.4
     back = turned_back(prediction(upright), prediction(as_taken), CAMERA, roll).values
-    steps = np.maximum(np.abs(np.diff(np.log(back), axis=0))[:, 1:], np.abs(np.diff(np.log(back), axis=1))[1:])
+    steps = np.maximum(
+        np.abs(np.diff(np.log(back), axis=0))[:, 1:], np.abs(np.diff(np.log(back), axis=1))[1:]
+    )
     assert steps.max() < 0.02
     assert back[5, 5] == pytest.approx(2.0 * np.exp(0.3), rel=0.08)
     assert back[5, 154] == pytest.approx(2.0 * np.exp(0.5), rel=0.08)

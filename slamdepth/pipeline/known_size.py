@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.errors import DatasetError
+from slamdepth.datasets import Dataset
+from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.evaluation import score_trajectory
 from slamdepth.evaluation.bootstrap import block_resamples
 from slamdepth.geometry import umeyama
@@ -30,10 +31,13 @@ PREDICTED_HEIGHT_SIGMA_LOG = 0.12
 whole, which keyframes don't average out. 14 % too high in the rendered room, where it is known."""
 LENGTH_SIGMA_LOG = 0.01
 """How well people measure a distance."""
+SENSOR_SIGMA_LOG = 0.03
+"""Of a Kinect's depth: the factors in use for one camera of TUM RGB-D differ by 4 %."""
 DRIFT = 0.01
 """Share of the path by which the distance of two places on it may be wrong."""
 _MAX_GAP_S = 0.5
 _MAX_SIGMA_LOG = 0.3
+_FEWEST_POINTS = 20
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,37 @@ def from_camera_height(keyframes: Sequence[Keyframe], height_m: float, max_depth
     is_sensor = any(keyframe.prediction.is_sensor for keyframe in keyframes)
     sigma_log = math.hypot(HEIGHT_SIGMA_LOG if is_sensor else PREDICTED_HEIGHT_SIGMA_LOG, floor.sigma_log)
     return ScaleEstimate(ScaleSource.CAMERA_HEIGHT, height_m / floor.height, sigma_log, how)
+
+
+def from_sensor(dataset: Dataset, keyframes: Sequence[Keyframe]) -> ScaleEstimate:
+    """Compare the sensor's depth with the map's at the keypoints of every keyframe.
+
+    What predictions are multiplied by is fitted to all pixels; the map is made of those that can be tracked,
+    where a network errs in another way.
+
+    Raises:
+        DatasetError: no keyframe has both.
+    """
+    logs = []
+    for keyframe in keyframes:
+        try:
+            sensor_m = dataset.read(keyframe.frame.index, with_depth=True).depth_m
+        except ImageDecodeError:
+            continue
+        if sensor_m is None:
+            continue
+        u, v = np.rint(keyframe.keypoints_px).astype(np.int64).T
+        inside = (u >= 0) & (v >= 0) & (u < sensor_m.shape[1]) & (v < sensor_m.shape[0])
+        theirs, ours = sensor_m[v[inside], u[inside]], keyframe.depth_m[v[inside], u[inside]]
+        both = (theirs > 0) & (ours > 0)
+        if np.count_nonzero(both) >= _FEWEST_POINTS:
+            logs.append(float(np.median(np.log(theirs[both]) - np.log(ours[both]))))
+    if not logs:
+        raise DatasetError("no keyframe has sensor depth at its keypoints")
+    medians = np.median(np.array(logs)[block_resamples(len(logs), resamples=200)], axis=1)
+    how = f"the sensor's depth at the keypoints of {len(logs)} keyframes"
+    sigma_log = math.hypot(SENSOR_SIGMA_LOG, float(np.std(medians)))
+    return ScaleEstimate(ScaleSource.GROUND_TRUTH_DEPTH, math.exp(np.median(logs)), sigma_log, how)
 
 
 def from_baseline(

@@ -7,6 +7,7 @@ A number, a file of ``slamdepth scale``, or what this sequence's own sensor says
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from slamdepth.depth.scale import DepthScale, ScaleDomain, ScaleFit, fit_scale, 
 from slamdepth.depth.scale_file import check_same_model, read_scale
 from slamdepth.depth.scaled import ScaledDepth
 from slamdepth.errors import ConfigError, DatasetError, ImageDecodeError
+from slamdepth.pipeline.known_size import SENSOR_SIGMA_LOG
 from slamdepth.pipeline.options import RunInterrupted
 from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.report import ScaleSource
@@ -30,8 +32,9 @@ NETWORK_SIGMA_LOG = 0.2
 """Assumed deviation of a network's scale that all frames of a place share: the shipped head was off
 by 0.10 to 0.17 on three real sequences it had not seen (README), by more on some places held out."""
 
-SENSOR_SIGMA_LOG = 0.03
-"""Of a Kinect's depth: the factors in use for one camera of TUM RGB-D differ by 4 %."""
+MAP_SIGMA_LOG = 0.12
+"""Assumed deviation of a map's scale from that of all pixels of its predictions: points lie where there is
+texture. On fr1_rpy and fr1_desk the two differ by a tenth."""
 
 _FIT_FRAMES = 60
 
@@ -43,8 +46,7 @@ class PredictionScale:
     Attributes:
         source: NETWORK or SENSOR where predictions stay as they are.
         scale: what predictions are made metric by, or None.
-        sigma_log: deviation of the log of the resulting scale, known or assumed.
-        sigma_is_known: False where ``sigma_log`` is an assumption.
+        sigma_log: assumed deviation of the log of the resulting scale of the map.
         how: a phrase.
         from_ground_truth: the scale comes from this sequence's own sensor.
         fit: where this run fitted it.
@@ -54,7 +56,6 @@ class PredictionScale:
     source: ScaleSource
     how: str
     sigma_log: float
-    sigma_is_known: bool = False
     scale: DepthScale | None = None
     from_ground_truth: bool = False
     fit: ScaleFit | None = None
@@ -148,10 +149,11 @@ def choose_prediction_scale(
 
 
 def _of_fit(source: ScaleSource, fit: ScaleFit, how: str, *, own: bool) -> PredictionScale:
-    is_known = own and fit.scale_sigma_log is not None
-    sigma_log = fit.scale_sigma_log if own and fit.scale_sigma_log is not None else NETWORK_SIGMA_LOG
+    sigma_log = NETWORK_SIGMA_LOG
+    if own and fit.scale_sigma_log is not None:
+        sigma_log = math.hypot(fit.scale_sigma_log, MAP_SIGMA_LOG)
     return PredictionScale(
-        source, how, sigma_log, is_known, fit.scale, own, None if source is ScaleSource.FILE else fit
+        source, how, sigma_log, fit.scale, own, None if source is ScaleSource.FILE else fit
     )
 
 

@@ -22,6 +22,7 @@ from slamdepth.pipeline.known_size import (
     from_baseline,
     from_camera_height,
     from_ground_truth,
+    from_sensor,
     fused,
     rescaled,
 )
@@ -46,12 +47,22 @@ def settle_scale(
             own.source, 1.0, math.hypot(before.sigma_log, spread / math.sqrt(len(votes))), own.how
         )
     found, notes = _known_sizes(dataset, reconstruction, before, config)
+    measured = None
+    if before.fit is not None:
+        try:
+            own = measured = from_sensor(dataset, reconstruction.keyframes)
+        except DatasetError as error:
+            notes.append(f"the map's own scale was not compared with the sensor: {error}")
     prediction_factor = before.scale.scale if before.scale is not None else 1.0
     parts: tuple[ScalePart, ...] = ()
     from_ground_truth = before.from_ground_truth
     if not found:
         estimate = own
-        sentence = _own_sentence(before, len(votes), spread, own.sigma_log)
+        sentence = (
+            _own_sentence(before, len(votes), spread, own.sigma_log)
+            if measured is None
+            else _measured_sentence(before, measured)
+        )
     elif before.wants_trajectory:
         estimate, from_ground_truth = found[0], True
         sentence = (
@@ -68,6 +79,8 @@ def settle_scale(
         largest = max(parts, key=lambda part: part.weight).source
         estimate = ScaleEstimate(largest, factor, sigma_log, "")
         sentence = _fused_sentence(together, weights, estimate)
+    sentence += "".join(f"; {note}" for note in notes)
+    if found and not before.wants_trajectory:
         notes += _disagreements(own, found)
     if from_ground_truth:
         sentence += f"; {_NO_CLAIM}"
@@ -130,13 +143,18 @@ def _own_sentence(before: PredictionScale, votes: int, spread: float | None, sig
     sure = f"true metres within about {100 * sigma_log:.0f} %"
     if before.source is ScaleSource.VALUE:
         sure = "how true it is nobody measured"
-    elif not before.sigma_is_known:
+    else:
         sure += " in two of three places, an assumption"
-    elif votes:
-        sure += ", one standard error"
     if before.source is ScaleSource.NETWORK:
         return f"metric as far as the {before.how} is{agreed}; no sensor measured it: {sure}"
     return f"{before.how}{agreed}: {sure}"
+
+
+def _measured_sentence(before: PredictionScale, measured: ScaleEstimate) -> str:
+    return (
+        f"{before.how}; then the map was multiplied by {measured.factor:.4g} after {measured.how}: true "
+        f"metres within about {100 * measured.sigma_log:.0f} %, one standard error"
+    )
 
 
 def _fused_sentence(together: list[ScaleEstimate], weights: tuple[float, ...], result: ScaleEstimate) -> str:
@@ -153,10 +171,11 @@ def _fused_sentence(together: list[ScaleEstimate], weights: tuple[float, ...], r
 def _disagreements(own: ScaleEstimate, found: list[ScaleEstimate]) -> list[str]:
     notes = []
     for estimate in found:
-        apart = abs(math.log(estimate.factor)) / math.hypot(own.sigma_log, estimate.sigma_log)
+        ratio = estimate.factor / own.factor
+        apart = abs(math.log(ratio)) / math.hypot(own.sigma_log, estimate.sigma_log)
         if apart > 3:
             notes.append(
                 f"the scale by {estimate.source.value} and that of the depth differ by a factor of "
-                f"{estimate.factor:.2f}, {apart:.1f} standard deviations: check the known size"
+                f"{ratio:.2f}, {apart:.1f} standard deviations: check the known size"
             )
     return notes
