@@ -313,6 +313,8 @@ class Reconstruction:
         readout_s: seconds the camera took from an image's first row to its last, as the
             trajectory was made with; 0 for a global shutter, None where it plays no part.
         readout_sigma_s: its deviation where it was found out, None where it was given.
+        down_w: ``(3,)`` unit direction of gravity in the world frame, by what most keyframes' images tell;
+            None where none was told or they disagree, as with a sensor.
     """
 
     trajectory: Trajectory
@@ -328,3 +330,4 @@ class Reconstruction:
     scale_votes: tuple[float, ...] = ()
     readout_s: float | None = None
     readout_sigma_s: float | None = None
+    down_w: NDArray[np.float64] | None = None

@@ -31,6 +31,8 @@ from slamdepth.tracker import CloudTracker, Tracker, create_tracker
 from slamdepth.tracker.map_adjuster import MapAdjuster
 from slamdepth.types import DepthKind, DepthPrediction, Frame, Reconstruction, TrackingStatus
 
+DOWN_W = np.array([0.1, 0.9, 0.3]) / np.linalg.norm([0.1, 0.9, 0.3])
+
 
 @pytest.fixture(scope="module")
 def sensor_run() -> tuple[Run, Reconstruction]:
@@ -93,6 +95,27 @@ def test_the_reconstruction_is_consistent(
         assert np.isfinite(made.points_m).all()
         assert set(made.timings_ms) >= {"features", "tracking", "depth", "mapping", "bundle"}
         assert all(ms >= 0 for ms in made.timings_ms.values())
+
+
+class ToldDown(ConstantDepth):
+    """Finds ``DOWN_W`` in each image, as the true camera would see it."""
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        R_world_camera = walk()[1][frame.index][:3, :3]
+        return replace(super().predict(frame), gravity=R_world_camera.T @ DOWN_W, gravity_share=0.8)
+
+
+def test_gravity_that_the_images_told_is_handed_on_in_the_world(
+    sensor_run: tuple[Run, Reconstruction], constant_run: tuple[Run, Reconstruction]
+) -> None:
+    made = Run(frames(change=colour_only), ToldDown()).finish()
+    assert made.down_w is not None
+    assert np.linalg.norm(made.down_w) == pytest.approx(1.0)
+    assert made.down_w @ DOWN_W > np.cos(np.radians(1.0))
+    np.testing.assert_array_equal(  # a model that does not listen: nothing else may change
+        made.trajectory.T_world_camera, constant_run[1].trajectory.T_world_camera
+    )
+    assert sensor_run[1].down_w is constant_run[1].down_w is None
 
 
 def test_steps_say_what_was_done(sensor_run: tuple[Run, Reconstruction]) -> None:

@@ -31,6 +31,7 @@ def test_what_most_images_tell_is_known_in_any_camera() -> None:
     known = gravity.in_camera(R)
     assert known is not None
     assert known @ (R.T @ DOWN_W) > np.cos(np.radians(3))
+    np.testing.assert_allclose(R @ known, gravity.in_world(), atol=1e-12)
 
 
 def test_nothing_is_known_before_enough_agree() -> None:
@@ -41,6 +42,7 @@ def test_nothing_is_known_before_enough_agree() -> None:
         apart.add(R, R.T @ np.roll(DOWN_W, k % 2 + 1), 1.0)
     assert few.in_camera(np.eye(3)) is None
     assert apart.in_camera(np.eye(3)) is None
+    assert few.in_world() is apart.in_world() is None
 
 
 def test_an_unsure_image_counts_less() -> None:
@@ -81,6 +83,15 @@ def test_the_thread_tells_later_frames_what_earlier_ones_found() -> None:
     told = [k for k, down in enumerate(model.told) if down is not None]
     assert told == [6, 7, 8, 10, 11]  # six are asked, then every fifth of all
     assert all(np.allclose(model.told[k], DOWN_W) for k in told)
+
+
+def test_the_thread_says_where_down_is_in_the_world() -> None:
+    thread = DepthThread(Asked())
+    assert thread.down_w() is None
+    for k in range(6):
+        thread.ask(frame(k), np.eye(3))
+    np.testing.assert_allclose(thread.down_w(), DOWN_W)  # waits for the six
+    thread.close()
 
 
 def test_a_frame_that_says_itself_or_has_no_pose_is_left_alone() -> None:

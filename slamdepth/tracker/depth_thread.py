@@ -74,6 +74,11 @@ class DepthThread:
             del self._asked[n]
         return self._taken[1]
 
+    def down_w(self) -> NDArray[np.float64] | None:
+        """Unit direction of gravity ``(3,)`` in the world, by all frames asked for so far; waits for them.
+        None where they do not tell it."""
+        return self._pool.submit(self._gravity.in_world).result()
+
     def close(self) -> None:
         """End the thread."""
         self._pool.shutdown(wait=True)

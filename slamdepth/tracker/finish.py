@@ -153,6 +153,7 @@ def build_reconstruction(
     timings_ms: dict[str, float],
     notes: list[str],
     scale_votes: tuple[float, ...] = (),
+    down_w: Floats | None = None,
 ) -> Reconstruction:
     """The value handed to the user, with every frame placed anew where ``refine_frames``."""
     # NumPy and the disk work in other threads while this one places frames
@@ -175,6 +176,7 @@ def build_reconstruction(
         scale_votes=scale_votes,
         readout_s=shutter.readout_s,
         readout_sigma_s=shutter.sigma_s,
+        down_w=down_w,
     )
 
 

@@ -305,6 +305,7 @@ class Tracker:
                 timings_ms=self._watch.mean_ms(),
                 notes=notes,
                 scale_votes=votes,
+                down_w=self._depth.down_w(),
             )
             self._depth.close()
             self._side.close()

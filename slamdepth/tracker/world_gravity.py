@@ -30,7 +30,7 @@ class WorldGravity:
         """Direction of gravity ``(3,)`` in a camera's frame; None where its image had better be asked:
         before enough agree, and every fifth time."""
         self._asked += 1
-        down_w = self._agreed()
+        down_w = self.in_world()
         if down_w is None or self._asked % _ASKED_AGAIN == 0:
             return None
         return R_world_camera.T @ down_w
@@ -40,8 +40,8 @@ class WorldGravity:
         self._told.append(R_world_camera @ down)
         self._shares.append(share)
 
-    def _agreed(self) -> Array | None:
-        """The direction ``(3,)`` in the world that most agree on."""
+    def in_world(self) -> Array | None:
+        """The unit direction ``(3,)`` in the world that most agree on; None before enough do."""
         if len(self._told) < _ENOUGH:
             return None
         told, shares = np.stack(self._told), np.array(self._shares)
