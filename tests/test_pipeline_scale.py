@@ -131,6 +131,16 @@ def test_no_floor_no_height() -> None:
         from_camera_height(room(None), 1.4, 4.0)
 
 
+@pytest.mark.parametrize("tilt_deg", [20.0, 50.0, 70.0])
+def test_known_gravity_finds_the_floor_however_the_camera_is_held(tilt_deg: float) -> None:
+    tilt = math.radians(tilt_deg)
+    down_w = se3_exp(np.array([0, 0, 0, -tilt, 0, 0]))[:3, :3].T @ np.array([0.0, 1.0, 0.0])
+    floor = find_floor(room(1.4, None, tilt), 4.0, down_w=down_w)
+    assert floor is not None
+    assert floor.height == pytest.approx(1.4, rel=0.01)
+    assert floor.tilt_deg < 1.0
+
+
 def test_the_floor_of_a_map_of_another_size_is_as_far_away() -> None:
     small = rescaled(reconstruction_of(keyframes=room(1.4, 0.7)), 0.5).keyframes
     found = from_camera_height(small, 1.4, 2.0)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """How high the first camera was over the floor, from the depth of the keyframes.
 
-Gravity is not measured. The first camera is taken to have been held upright to within
-``MAX_TILT_DEG``, so the floor is a plane whose normal is that close to its y axis, below
-it. Of several such planes (seats, desks, the floor) the lowest that is large and has next to
-nothing beneath it is the floor.
+The floor is a plane below the first camera whose normal is close to gravity, where that is known. Where
+it is not, the first camera is taken to have been held upright to within ``MAX_TILT_DEG``. Of several such
+planes (seats, desks, the floor) the lowest that is large and has next to nothing beneath it is the floor.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 MAX_TILT_DEG = 35.0
+_KNOWN_TILT_DEG = 20.0  # predicted floors lean, and gravity as images tell it errs by some degrees
 
 _MAX_KEYFRAMES = 40
 _STEP = 2  # of a view 160 pixels wide
@@ -48,7 +48,7 @@ class Floor:
         height: of the first camera over it, in metres of the map.
         sigma_log: standard error of the log of the height, from how much the heights
             differ that single keyframes see.
-        tilt_deg: between the first camera's y axis and the normal.
+        tilt_deg: between the normal and gravity, or the first camera's y axis where that is not known.
         keyframes: that see it.
         share: of all points that lie on it.
     """
@@ -61,13 +61,37 @@ class Floor:
     share: float
 
 
-def find_floor(keyframes: Sequence[Keyframe], max_depth_m: float, *, seed: int = 0) -> Floor | None:
+@dataclass(frozen=True)
+class _Upright:
+    """What a floor's plane has to be like."""
+
+    down: Floats
+    least_cosine: float
+    min_height: float
+
+    def plane(self, normal: Floats, point: Floats) -> tuple[Floats, float] | None:
+        """Unit normal (down) and height of a plane that may be a floor, else None."""
+        length = float(np.linalg.norm(normal))
+        if length < 1e-12:
+            return None
+        cosine = float(normal @ self.down) / length
+        normal = normal / length * (1.0 if cosine > 0 else -1.0)
+        height = float(normal @ point)
+        return None if abs(cosine) < self.least_cosine or height < self.min_height else (normal, height)
+
+
+def find_floor(
+    keyframes: Sequence[Keyframe], max_depth_m: float, *, down_w: Floats | None = None, seed: int = 0
+) -> Floor | None:
     """The floor below the first camera, or None where no large level surface is found there.
 
     Args:
         keyframes: in order of time; the world is the first camera.
         max_depth_m: depth beyond is not used.
+        down_w: unit direction of gravity ``(3,)`` in the world; None where it is not known.
     """
+    down = np.array([0.0, 1.0, 0.0]) if down_w is None else down_w
+    max_tilt_deg = MAX_TILT_DEG if down_w is None else _KNOWN_TILT_DEG
     chosen = np.unique(np.linspace(0, len(keyframes) - 1, min(len(keyframes), _MAX_KEYFRAMES)).astype(int))
     clouds = [_points_and_normals(keyframes[i], max_depth_m) for i in chosen]
     if not clouds or not (total := sum(len(points) for points, _ in clouds)):
@@ -77,12 +101,13 @@ def find_floor(keyframes: Sequence[Keyframe], max_depth_m: float, *, seed: int =
     owner = np.repeat(np.arange(len(clouds)), [len(points) for points, _ in clouds])
     scale = float(np.median(np.linalg.norm(points, axis=1)))
     tolerance = _TOLERANCE * scale
-    level = np.abs(normals[:, 1]) > math.cos(math.radians(MAX_TILT_DEG + _NORMAL_TOLERANCE_DEG))
+    level = np.abs(normals @ down) > math.cos(math.radians(max_tilt_deg + _NORMAL_TOLERANCE_DEG))
+    upright = _Upright(down, math.cos(math.radians(max_tilt_deg)), _MIN_HEIGHT * scale)
     rng = np.random.default_rng(seed)
     left = level.copy()
     best: tuple[float, Floats, NDArray[np.bool_]] | None = None
     for _ in range(_PLANES):
-        found = _plane(points[left], normals[left], tolerance, _MIN_HEIGHT * scale, rng)
+        found = _plane(points[left], normals[left], tolerance, upright, rng)
         if found is None:
             break
         normal, height = found
@@ -108,7 +133,7 @@ def find_floor(keyframes: Sequence[Keyframe], max_depth_m: float, *, seed: int =
         normal=normal,
         height=height,
         sigma_log=spread / height / math.sqrt(max(1, len(heights))),
-        tilt_deg=math.degrees(math.acos(min(1.0, float(normal[1])))),
+        tilt_deg=math.degrees(math.acos(min(1.0, float(normal @ down)))),
         keyframes=len(heights),
         share=float(np.mean(on_plane)),
     )
@@ -134,7 +159,7 @@ def _points_and_normals(keyframe: Keyframe, max_depth_m: float) -> tuple[Floats,
 
 
 def _plane(
-    points: Floats, normals: Floats, tolerance: float, min_height: float, rng: np.random.Generator
+    points: Floats, normals: Floats, tolerance: float, upright: _Upright, rng: np.random.Generator
 ) -> tuple[Floats, float] | None:
     """The level plane below the world's origin that most points lie on (RANSAC, then least squares)."""
     if len(points) < _MIN_POINTS:
@@ -144,7 +169,7 @@ def _plane(
     best, most = None, 0
     for three in rng.integers(0, len(some), (_TRIALS, 3)):
         a, b, c = some[three]
-        found = _upright(np.cross(b - a, c - a), a, min_height)
+        found = upright.plane(np.cross(b - a, c - a), a)
         if found is None:
             continue
         count = int(np.count_nonzero(_lies_on(some, some_normals, *found, tolerance)))
@@ -158,23 +183,11 @@ def _plane(
             return None
         centre = mine.mean(axis=0)
         axes = np.linalg.svd(mine - centre, full_matrices=False)[2]
-        better = _upright(axes[2], centre, min_height)
+        better = upright.plane(axes[2], centre)
         if better is None:
             return None
         best = better
     return best
-
-
-def _upright(normal: Floats, point: Floats, min_height: float) -> tuple[Floats, float] | None:
-    """Unit normal (down) and height of a plane that may be a floor, else None."""
-    length = float(np.linalg.norm(normal))
-    if length < 1e-12:
-        return None
-    normal = normal / length * (1.0 if normal[1] > 0 else -1.0)
-    height = float(normal @ point)
-    if normal[1] < math.cos(math.radians(MAX_TILT_DEG)) or height < min_height:
-        return None
-    return normal, height
 
 
 def _lies_on(

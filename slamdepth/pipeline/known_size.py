@@ -90,22 +90,26 @@ def fused(estimates: Sequence[ScaleEstimate]) -> tuple[float, float, tuple[float
     return math.exp(log_factor), float(information.sum() ** -0.5), tuple(map(float, weights))
 
 
-def from_camera_height(keyframes: Sequence[Keyframe], height_m: float, max_depth_m: float) -> ScaleEstimate:
+def from_camera_height(
+    keyframes: Sequence[Keyframe], height_m: float, max_depth_m: float, down_w: Floats | None = None
+) -> ScaleEstimate:
     """Compare the first camera's known height with that over the floor of the map.
+
+    Args:
+        max_depth_m: depth beyond is not used.
+        down_w: direction of gravity ``(3,)`` in the world, where it is known.
 
     Raises:
         DatasetError: no floor is found.
     """
-    floor = find_floor(keyframes, max_depth_m)
+    floor = find_floor(keyframes, max_depth_m, down_w=down_w)
     if floor is None:
-        raise DatasetError(
-            "no floor was found below the first camera (a large level surface, the first camera upright "
-            f"to within {MAX_TILT_DEG:g} degrees)"
-        )
+        held = f", the first camera upright to within {MAX_TILT_DEG:g} degrees" if down_w is None else ""
+        raise DatasetError(f"no floor was found below the first camera (a large level surface{held})")
+    level = "the first camera's y axis" if down_w is None else "level, by gravity as the images tell it"
     how = (
         f"a camera height of {height_m:g} m against {floor.height:.2f} m over the lowest large level "
-        f"surface, which {floor.keyframes} keyframes see, {floor.tilt_deg:.0f} degrees from the first "
-        "camera's y axis"
+        f"surface, which {floor.keyframes} keyframes see, {floor.tilt_deg:.0f} degrees from {level}"
     )
     is_sensor = any(keyframe.prediction.is_sensor for keyframe in keyframes)
     sigma_log = math.hypot(HEIGHT_SIGMA_LOG if is_sensor else PREDICTED_HEIGHT_SIGMA_LOG, floor.sigma_log)

@@ -118,7 +118,9 @@ def _known_sizes(
         tries.append(
             (
                 "from the camera height",
-                lambda: from_camera_height(reconstruction.keyframes, height_m, reach_m),
+                lambda: from_camera_height(
+                    reconstruction.keyframes, height_m, reach_m, reconstruction.down_w
+                ),
             )
         )
     if (length_m := scale.baseline_m) is not None:
