@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import copy_of, images, replace_image, slamdepth
+from command_line import call, copy_of, images, replace_image, slamdepth
 
 from slamdepth.io import read_tum_trajectory
 
@@ -124,6 +124,15 @@ def test_evaluate_gives_the_figures_of_the_report(
     for kind in ("se3", "sim3"):
         assert score["ate"][kind]["rmse_m"] == pytest.approx(report["ate"][kind]["rmse_m"], abs=1e-8)
         assert f"{score['ate'][kind]['rmse_m']:.6f} m" in done.stdout
+
+
+def test_a_score_of_an_earlier_call_is_replaced(tiny_room: Path, tmp_path: Path) -> None:
+    out = tmp_path / "score.json"
+    truth = tiny_room / "groundtruth.txt"
+    for fps in (10, 30):
+        done = call("evaluate", truth, truth, "--fps", fps, "--output", out)
+        assert done.returncode == 0, done.stderr
+        assert json.loads(out.read_text())["rpe"]["per_second"]["delta_frames"] == fps
 
 
 def test_stride_limit_and_no_mesh(tiny_room: Path, tmp_path: Path) -> None:

@@ -112,6 +112,14 @@ def test_what_is_wrong_is_one_line(tiny_room: Path, pairs: Path, tmp_path: Path)
         assert said in done.stderr
 
 
+def test_figures_of_an_earlier_call_are_replaced(pairs: Path, tmp_path: Path) -> None:
+    output = tmp_path / "judged.json"
+    for frames in (1, 2):
+        done = call("eval-depth", "sensor", pairs, "--max-frames", frames, "-o", output)
+        assert done.returncode == 0, done.stderr
+        assert json.loads(output.read_text())["data"]["corner"]["frames"] == frames
+
+
 def test_a_folder_without_depth_is_refused(tmp_path: Path, tiny_room: Path) -> None:
     from command_line import copy_of
 

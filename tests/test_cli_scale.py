@@ -81,6 +81,14 @@ def test_a_scale_is_fitted_kept_and_applied(tiny_room: Path, tmp_path: Path) -> 
     assert "was fitted with other weights of 'flat'" in other.stderr
 
 
+def test_a_scale_of_an_earlier_call_is_replaced(tiny_room: Path, tmp_path: Path) -> None:
+    file = tmp_path / "scale.yaml"
+    for frames in (1, 2):
+        done = call("scale", tiny_room, "--depth", "flat", "--max-frames", frames, "--output", file)
+        assert done.returncode == 0, done.stderr
+        assert read_scale(file).frames == frames
+
+
 def test_ground_truth_depth_is_fitted_first(tiny_room: Path, tmp_path: Path) -> None:
     report = run(tiny_room, tmp_path / "run", "--depth-scale", "groundtruth")
     assert report["scale"]["source"] == "groundtruth-depth"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from slamdepth.errors import OutputError
-from slamdepth.pipeline.folder import FILES, RunFolder, run_log, write_log_to
+from slamdepth.pipeline.folder import FILES, RunFolder, run_log, writable_file, write_log_to
 
 
 def test_a_default_run_folder_is_always_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,6 +52,30 @@ def test_a_file_is_no_run_folder(tmp_path: Path) -> None:
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(OutputError, match="file"):
             RunFolder.plan(path, "desk", overwrite=True)
+
+
+def test_a_file_of_an_earlier_call_may_be_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "figures.json"
+    assert writable_file(path, ".json") == path
+    path.write_text("{}")
+    assert writable_file(path, ".json") == path
+    monkeypatch.chdir(tmp_path)
+    assert writable_file(Path("figures.json"), ".json") == Path("figures.json")
+    monkeypatch.setattr("os.access", lambda place, mode: Path(place).name != "figures.json")
+    with pytest.raises(OutputError, match="no permission to replace it"):
+        writable_file(path, ".json")
+
+
+def test_a_file_of_another_kind_is_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / "photo.png").write_text("")
+    for path, said in (
+        (tmp_path / "photo.png", "no .json file"),
+        (tmp_path, "is a folder"),
+        (tmp_path / "absent" / "figures.json", "no such folder"),
+        (tmp_path / "photo.png" / "figures.json", "is a file"),
+    ):
+        with pytest.raises(OutputError, match=said):
+            writable_file(path, ".json")
 
 
 def test_discarding_leaves_what_is_not_ours(tmp_path: Path) -> None:

@@ -149,17 +149,20 @@ def writable_file(path: Path, ending: str) -> Path:
     such as ``.json``) may be replaced; one that a user mixed up with it may not.
 
     Raises:
-        OutputError: it is a folder or another kind of file, or its folder is missing or
-            cannot be written.
+        OutputError: it is a folder or another kind of file, it may not be written, or its folder is
+            missing or cannot be written.
     """
     path = path.expanduser()
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; name a file for the results")
     if path.exists() and path.suffix.lower() != ending:
         raise OutputError(f"{path}: is there already and no {ending} file; name another file")
-    if path.parent.exists():
-        return writable(path)
-    raise OutputError(f"{path.parent}: no such folder to write to; make it first")
+    if not path.parent.exists():
+        raise OutputError(f"{path.parent}: no such folder to write to; make it first")
+    writable(path.parent)
+    if path.exists() and not os.access(path, os.W_OK):
+        raise OutputError(f"{path}: cannot be written: no permission to replace it")
+    return path
 
 
 def writable(path: Path) -> Path:
