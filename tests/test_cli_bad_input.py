@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib.resources import files
 from pathlib import Path
 
 import cv2
@@ -143,6 +144,16 @@ BAD_CALLS = {
         "command line: odometry 'kiss-icp' uses no features",
     ),
     "unknown device": ((*RUN, "--device", "tpu"), "'cpu' or 'cuda'"),
+    "depth on no device": (
+        ("depth", "SEQ", "--device", "gpu", "-o", "OUT"),
+        "unknown device 'gpu'; choose from",
+    ),
+    "scale on no device": (("scale", "SEQ", "--device", "mps"), "unknown device 'mps'; choose from"),
+    "eval-depth on no device": (("eval-depth", "dinov2", "SEQ", "--device", ""), "unknown device ''; choose"),
+    "train-depth on no device": (
+        ("train-depth", "TRAINING", "--dry-run", "--device", "banana"),
+        "unknown device 'banana'; choose from: cpu, cuda, cuda:N",
+    ),
     "no number": ((*RUN, "--max-frames", "many"), "Invalid value for '--max-frames'"),
     "stride 0": ((*RUN, "--stride", "0"), "Invalid value for '--stride'"),
     "voxel size": ((*RUN, "--voxel-size", "-1"), "map.voxel_size_m"),
@@ -176,6 +187,7 @@ def test_bad_calls(case: str, tiny_room: Path, tmp_path: Path) -> None:
         "OUT": tmp_path / "out",
         "GT": tiny_room / "groundtruth.txt",
         "BUSY": tmp_path,
+        "TRAINING": files("slamdepth") / "depth" / "configs" / "dinov2_head.yaml",
     }
     places["FILE"] = tmp_path / "file"
     places["FILE/out"] = tmp_path / "file" / "out"

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from slamdepth.depth import registry
 from slamdepth.depth import weights as store
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.card import ModelCard, card_of
@@ -109,6 +111,35 @@ def test_missing_cuda_is_one_line() -> None:
         pytest.skip("there is a CUDA device here")
     with pytest.raises(ConfigError, match="no CUDA device"):
         create_depth_model("dinov2", device="cuda")
+
+
+@pytest.mark.parametrize(
+    "device", ["gpu", "banana", "mps", "", "cuda:", "cuda:-1", "cuda:01", "CPU", "cuda0"]
+)
+@pytest.mark.parametrize("model", ["dinov2", "sensor", "mirrored:sensor", "onnx:absent.onnx", "dinov2-mlp"])
+def test_an_unknown_device_is_one_line(model: str, device: str) -> None:
+    with pytest.raises(ConfigError, match=f"^unknown device '{device}'; choose from: cpu, cuda, cuda:N"):
+        create_depth_model(model, device=device)
+
+
+def test_a_plug_in_is_given_a_device_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[str] = []
+
+    def factory(*, device: str, seed: int) -> object:
+        given.append(device)
+        return create_depth_model("sensor")
+
+    point = SimpleNamespace(value="elsewhere:make", load=lambda: factory)
+    monkeypatch.setattr(registry, "_plugins", lambda: {"elsewhere": [point]})
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    for device in ("cpu", "cuda", "cuda:1"):
+        create_depth_model("elsewhere", device=device)
+    with pytest.raises(ConfigError, match="'cuda:2': the last CUDA device is 'cuda:1'"):
+        create_depth_model("elsewhere", device="cuda:2")
+    with pytest.raises(ConfigError, match="unknown device 'gpu'"):
+        create_depth_model("elsewhere", device="gpu")
+    assert given == ["cpu", "cuda", "cuda:1"]
 
 
 def test_missing_backbone_names_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

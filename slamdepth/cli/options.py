@@ -26,4 +26,6 @@ StrideOption = Annotated[int, typer.Option("--stride", min=1, metavar="N", help=
 MaxFramesOption = Annotated[
     int | None, typer.Option("--max-frames", min=1, metavar="N", help="Take no more than N frames.")
 ]
-DeviceOption = Annotated[str, typer.Option("--device", metavar="cpu|cuda", help="Where the network runs.")]
+DeviceOption = Annotated[
+    str, typer.Option("--device", metavar="cpu|cuda|cuda:N", help="Where the network runs.")
+]

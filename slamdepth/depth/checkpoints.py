@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -115,8 +116,28 @@ def load_strictly(
 
 
 def check_device(device: str) -> None:
-    """Raise ConfigError where ``device`` is CUDA and there is none."""
+    """Make sure that ``device`` is one networks can run on here: ``cpu``, ``cuda`` or ``cuda:N``.
+
+    Raises:
+        ConfigError: it is another name, there is no CUDA device, or not so many.
+    """
+    check_device_name(device)
+    if device == "cpu":
+        return
     import torch
 
-    if device.startswith("cuda") and not torch.cuda.is_available():
+    if not torch.cuda.is_available():
         raise ConfigError(f"device '{device}': no CUDA device is available; use 'cpu'")
+    _, _, number = device.partition(":")
+    if number and int(number) >= (count := torch.cuda.device_count()):
+        raise ConfigError(f"device '{device}': the last CUDA device is 'cuda:{count - 1}'")
+
+
+def check_device_name(device: str) -> None:
+    """Make sure that ``device`` names one that networks can run on, wherever that may be.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    if not re.fullmatch(r"cpu|cuda(:(0|[1-9][0-9]*))?", device):
+        raise ConfigError(f"unknown device '{device}'; choose from: cpu, cuda, cuda:N (the Nth CUDA device)")

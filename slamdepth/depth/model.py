@@ -30,7 +30,6 @@ from slamdepth.depth.preprocess import (
 from slamdepth.depth.registry import register
 from slamdepth.depth.turning import roll_rad, turned, turned_back
 from slamdepth.depth.vanishing import find_lines, manhattan_frames
-from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 
 _TURN_RAD = math.radians(8.0)
@@ -108,10 +107,7 @@ class Dinov2Depth:
 
         Raises:
             WeightsError: one line: what is missing or damaged, and what to do.
-            ConfigError: the device is not there.
         """
-        if device.startswith("cuda") and not torch.cuda.is_available():
-            raise ConfigError(f"device '{device}': no CUDA device is available; use 'cpu'")
         head_file = head or store.head_path()
         backbone_file = store.find_backbone(backbone)
         backbone_info = store.backbone_info(backbone_file)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from slamdepth.depth.base import DepthModel
+from slamdepth.depth.checkpoints import check_device, check_device_name
 from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind
 
@@ -84,7 +85,7 @@ def create_depth_model(
 
     Args:
         name: one of :func:`depth_model_names`.
-        device: where its network runs, ``"cpu"`` or ``"cuda"``.
+        device: where its network runs: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, checked for every model.
         seed: for models with something random; the ones here have nothing.
         weights: its weights file; default: by its official name from the cache folder.
 
@@ -101,9 +102,11 @@ def create_depth_model(
     if name.startswith(_ONNX):
         if weights is not None:
             raise ConfigError(f"depth model '{name}' names its file already; leave out the weights")
+        check_device_name(device)  # ONNX Runtime has CUDA devices of its own, without PyTorch's
         from slamdepth.depth.onnx_model import create
 
         return create(name.removeprefix(_ONNX), device=device, seed=seed)
+    check_device(device)
     if name not in _factories and name in _MODULES:
         importlib.import_module(_MODULES[name])
     if name not in _factories:
