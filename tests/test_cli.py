@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import io
 import json
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import pytest
 from command_line import call, copy_of, images, replace_image, slamdepth
 
+from slamdepth.cli.console import console, print_places
 from slamdepth.io import read_tum_trajectory
 
 COMMANDS = (
@@ -94,9 +97,24 @@ def test_the_table_says_what_came_out_and_where(run_folder: Path, report: dict[s
     ):
         assert row in shown
     assert f"{report['ate']['se3']['rmse_m']:.4f} m" in shown
-    flat = shown.replace("\n", "").replace(" ", "")
     for name in ("trajectory.txt", "mesh.ply", "report.html"):
-        assert f"{run_folder}/{name}" in flat
+        assert f"   {run_folder}/{name}\n" in shown
+
+
+def test_paths_are_never_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    path = "/a folder/" + "long-" * 60 + "/[bold]report.html"
+    written = io.StringIO()
+    for columns in ("40", None):
+        written.truncate(0)
+        monkeypatch.setenv("COLUMNS", "40")
+        if columns is None:
+            monkeypatch.delenv("COLUMNS")
+        with redirect_stdout(written):
+            out = console()
+            print_places(out, {"results": path, "report": path})
+            out.print("word " * 60)
+        assert written.getvalue().count(f"   {path}\n") == 2
+        assert (written.getvalue().count("\n") == 3) is (columns is None)
 
 
 def test_the_report_names_no_folder_of_this_machine(run_folder: Path) -> None:

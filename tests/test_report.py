@@ -376,9 +376,12 @@ def test_console_tables() -> None:
     summary = build_summary(data)
     score = data.trajectory_score
     assert score is not None
-    text = rendered(run_table(summary, {"where": "runs/[bold]x"}))
+    text = rendered(run_table({**summary, "sequence": "runs/[bold]x"}))
     for part in ("70 (87.5 %)", "12.5", "Scale comes from", f"{score.se3.rmse_m:.4f} m", "runs/[bold]x"):
         assert part in text
+    assert "80 of 82 images; 2 could not be read" in text
+    assert "70 (87.5 %); 85.4 % of all 82 images" in text
+    assert "could not be read" not in rendered(run_table({**summary, "skipped_frames": 0}))
     assert "not scored" in rendered(run_table(build_summary(bare_data())))
     assert f"{score.sim3.rmse_m:.6f} m" in rendered(trajectory_table(score.to_dict()))
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+_UNBROKEN = 4096  # columns, wider than any table
 
 
 def _set_verbose(asked: bool) -> bool:
@@ -41,10 +44,20 @@ def is_verbose() -> bool:
 
 
 def console() -> Console:
-    """Standard output: results."""
+    """Standard output: results; into a file or a pipe lines are as long as they are."""
     from rich.console import Console
 
-    return Console(highlight=False, soft_wrap=False)
+    out = Console(highlight=False, soft_wrap=False)
+    if not out.is_terminal and "COLUMNS" not in os.environ:
+        out.width = _UNBROKEN
+    return out
+
+
+def print_places(out: Console, places: Mapping[str, object]) -> None:
+    """Print where each result lies, a line each; a path is never broken, so that it can be copied."""
+    width = max(map(len, places))
+    for name, place in places.items():
+        out.print(f"  {name:<{width}}   {place}", markup=False, soft_wrap=True)
 
 
 def error_console() -> Console:

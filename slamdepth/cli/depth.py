@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slamdepth.cli.console import QuietOption, VerboseOption, console
+from slamdepth.cli.console import QuietOption, VerboseOption, console, print_places
 from slamdepth.cli.options import (
     CameraOption,
     DepthOption,
@@ -95,10 +95,10 @@ def _print_result(result: DepthMapResult, quiet: bool) -> None:
         ("unit", about["unit"]),
         ("scale", about["scale"]),
         *(("intrinsics", f"{group['how']} ({images(group['images'])})") for group in about["intrinsics"][:3]),
-        ("results", str(result.folder)),
     ]
     out = console()
     out.print(two_columns(f"{about['source']['name']} · depth: {about['model']['name']}", rows))
+    print_places(out, {"results": result.folder})
     if not quiet:
         for note in about["notes"]:
             out.print(f"note: {note}", style="yellow", markup=False)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slamdepth.cli.console import QuietOption, VerboseOption, console
+from slamdepth.cli.console import QuietOption, VerboseOption, console, print_places
 from slamdepth.cli.options import CameraOption, DepthWeightsOption, MaxFramesOption, StrideOption
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
@@ -184,7 +184,8 @@ def _print_result(result: RunResult, quiet: bool) -> None:
         if not file or (result.folder / file).exists()
     }
     out = console()
-    out.print(run_table(result.summary, places))
+    out.print(run_table(result.summary))
+    print_places(out, places)
     if not quiet:
         for note in result.summary["notes"]:
             out.print(f"note: {note}", style="yellow", markup=False)

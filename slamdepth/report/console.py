@@ -15,16 +15,14 @@ if TYPE_CHECKING:
     Rows = list[tuple[str, str]]
 
 
-def run_table(summary: dict[str, Any], places: dict[str, str] | None = None) -> Table:
+def run_table(summary: dict[str, Any]) -> Table:
     """What a run ends with.
 
     Args:
         summary: of :func:`slamdepth.report.build_summary`.
-        places: name of a result to where it lies, appended as rows.
     """
     rows = [
-        ("frames", count(summary["frames"])),
-        ("tracked", f"{count(summary['tracked'])} ({percent(summary['tracked_fraction'])})"),
+        *_frame_rows(summary),
         ("frames per second", fixed(summary["fps"], 1)),
         ("keyframes", count(summary["keyframes"])),
         ("loop closures", count(summary["loop_closures"])),
@@ -32,8 +30,6 @@ def run_table(summary: dict[str, Any], places: dict[str, str] | None = None) -> 
         ("scale", summary["scale"]["sentence"]),
         ("rolling shutter", summary["rolling_shutter"]["sentence"]),
     ]
-    if summary["skipped_frames"]:
-        rows.insert(1, ("images skipped", count(summary["skipped_frames"])))
     is_scored = summary["ate"]["se3"]["rmse_m"] is not None
     rows += _score_rows(summary, 4) if is_scored else [("ATE, RPE", "not scored")]
     depth = summary["depth"]["metric"]
@@ -42,9 +38,21 @@ def run_table(summary: dict[str, Any], places: dict[str, str] | None = None) -> 
     mesh = summary["mesh"]
     if mesh["vertices"] is not None:
         rows.append(("mesh", f"{count(mesh['vertices'])} vertices, {count(mesh['triangles'])} triangles"))
-    rows += list((places or {}).items())
     features = f" · features: {summary['features']}" if summary["features"] else ""
     return two_columns(f"{summary['sequence']} · depth: {summary['depth_model']}{features}", rows)
+
+
+def _frame_rows(summary: dict[str, Any]) -> Rows:
+    """Where images could not be read, what was tracked is told as a share of all as well."""
+    frames, tracked, unread = summary["frames"], summary["tracked"], summary["skipped_frames"]
+    placed = f"{count(tracked)} ({percent(summary['tracked_fraction'])})"
+    if not unread:
+        return [("frames", count(frames)), ("tracked", placed)]
+    images = frames + unread
+    return [
+        ("frames", f"{count(frames)} of {count(images)} images; {count(unread)} could not be read"),
+        ("tracked", f"{placed}; {percent(tracked / images)} of all {count(images)} images"),
+    ]
 
 
 def trajectory_table(figures: dict[str, Any], title: str = "trajectory", digits: int = 6) -> Table:
