@@ -20,12 +20,16 @@ CODECS = ("vp09", "mp4v")
 """VP9 first: browsers and players know it, and OpenCV's own FFmpeg brings it along; H.264 it
 cannot write."""
 
+MIN_FPS = 1.0
+"""No codec takes a frame an hour, and nobody watches it; images far apart are shown a second each."""
+
 
 @contextmanager
 def film_writer(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
     """A function that adds a frame ``(H, W, 3)`` RGB, of one even size throughout, to an mp4 file.
 
-    The file is moved to ``path`` when the block succeeds.
+    The file is moved to ``path`` when the block succeeds. It plays at ``fps``, at :data:`MIN_FPS` if that
+    is less.
 
     Raises:
         OutputError: no codec is there, or ``path`` cannot be written.
@@ -38,7 +42,7 @@ def film_writer(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8]]
         def add(frame_rgb: NDArray[np.uint8]) -> None:
             nonlocal writer
             if writer is None:
-                writer = _open(temporary, path, fps, frame_rgb.shape[1], frame_rgb.shape[0])
+                writer = _open(temporary, path, max(fps, MIN_FPS), frame_rgb.shape[1], frame_rgb.shape[0])
             writer.write(cv2.cvtColor(frame_rgb, cv2.COLOR_RGB2BGR))
 
         try:
