@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import threading
@@ -345,6 +346,30 @@ def test_a_full_disk_is_told_after_the_first_image(tmp_path: Path, monkeypatch: 
     with pytest.raises(OutputError, match="GB free; leave out the point clouds"):
         make(photos(tmp_path / "in"), tmp_path / "out")
     assert SEEN == [0]
+
+
+@pytest.mark.parametrize(
+    ("cloud", "said"), [(True, r"--no-cloud leaves out \d\d% of that"), (False, "--stride and --max-frames")]
+)
+def test_many_gigabytes_are_told_after_the_first_image(
+    cloud: bool, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    source = photos(tmp_path / "in")
+    make(source, tmp_path / "small", cloud=cloud)
+    assert "GB" not in caplog.text
+    monkeypatch.setattr("slamdepth.pipeline.depth_maps.job._MUCH_BYTES", 1000)
+    about = make(source, tmp_path / "large", cloud=cloud)
+    (told,) = [record.getMessage() for record in caplog.records if "GB" in record.getMessage()]
+    assert re.fullmatch(
+        rf"{about['frames'] - 1} images? still to do, about .* GB, .* GB free; {said}.*", told
+    )
+
+
+def test_images_far_apart_make_a_film_of_a_second_each(tmp_path: Path) -> None:
+    make(film(tmp_path / "v.mp4", count=6), tmp_path / "out", stride=100_000)
+    made = cv2.VideoCapture(str(tmp_path / "out" / "side-by-side.mp4"))
+    assert made.get(cv2.CAP_PROP_FPS) == 1.0
+    assert made.read()[0]
 
 
 def test_the_command_says_what_it_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

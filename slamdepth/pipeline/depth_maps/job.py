@@ -55,6 +55,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+_MUCH_BYTES = 1e9  # from here on the user is told what is coming
+
 
 def make_depth_maps(
     options: DepthMapOptions,
@@ -269,14 +271,32 @@ class _Job:
         self._write_about(complete=False, drawn={"colours": drawn, "film": film})
 
     def _check_space(self, name: str, total: int) -> None:
-        """After the first image: is there room for the others?"""
-        size = sum(self._place(kind, name).stat().st_size for kind in self._now_files())
-        still = size * (total - len([n for n in self.folder.frames if n != name]) - 1)
+        """After the first image: is there room for the others, and is it much that they take?
+
+        What is drawn at the end, colour maps and the film, is small beside it and not counted.
+        """
+        sizes = {kind: self._place(kind, name).stat().st_size for kind in self._now_files()}
+        others = total - len([n for n in self.folder.frames if n != name]) - 1
+        still, clouds = others * sum(sizes.values()), sizes.get(CLOUD, 0)
         free = shutil.disk_usage(self.folder.path).free
         if still > free:
+            leave_out = "leave out the point clouds (--no-cloud), " if clouds else ""
             raise OutputError(
-                f"{self.folder.path}: {still / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB free; leave "
-                "out the point clouds (--no-cloud), take fewer images (--stride, --max-frames)"
+                f"{self.folder.path}: {still / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB free; "
+                f"{leave_out}take fewer images (--stride, --max-frames)"
+            )
+        if still > _MUCH_BYTES:
+            less = (
+                f"--no-cloud leaves out {clouds / sum(sizes.values()):.0%} of that"
+                if clouds
+                else "--stride and --max-frames take fewer"
+            )
+            logger.warning(
+                "%s still to do, about %.1f GB, %.1f GB free; %s",
+                images(others),
+                still / 1e9,
+                free / 1e9,
+                less,
             )
 
     def _write_about(self, *, complete: bool, drawn: dict[str, Any] | None = None) -> None:
