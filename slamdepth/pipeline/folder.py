@@ -6,8 +6,9 @@ from __future__ import annotations
 import logging
 import logging.handlers
 import os
+import shlex
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +24,9 @@ FILES = {
     "mesh.ply": "coloured mesh of the scene in the frame of the first camera, metres",
     "report.html": "figures and plots of the run; opens in any browser, needs nothing else",
     "report.json": "the same figures for programs",
-    "config.yaml": "the settings used; give it to --config for the same run again",
+    "config.yaml": "the settings used, for --config; which images and which camera are not among them",
     "log.txt": "what happened, in detail",
-    "README.txt": "this list",
+    "README.txt": "this list, and the command for the same run again",
 }
 """What each file of a run folder holds."""
 
@@ -69,8 +70,12 @@ class RunFolder:
             raise OutputError(f"{path}: holds an earlier run; name another folder or add --overwrite")
         return cls(writable(path), replaces=True)
 
-    def create(self) -> None:
+    def create(self, arguments: Sequence[str] = ()) -> None:
         """Make the folder, empty of the files of an earlier run, and its README.
+
+        Args:
+            arguments: of 'slamdepth run', as the user gave them, what ``config.yaml`` does not hold:
+                the README tells the command for the same run again.
 
         Raises:
             OutputError: it cannot be written.
@@ -85,6 +90,9 @@ class RunFolder:
         width = max(map(len, FILES))
         lines = [f"{name:<{width}}  {what}" for name, what in FILES.items()]
         head = f"{_MARK}. A file that is missing was not asked for, or the run was killed before it.\n\n"
+        if arguments:
+            command = shlex.join(["slamdepth", "run", *arguments, "--config", str(self.path / "config.yaml")])
+            lines += ["", "The same run again, from the folder this one was started in:", f"  {command}"]
         write_text(self.path / _README, head + "\n".join(lines) + "\n")
 
     def discard(self) -> None:

@@ -101,7 +101,7 @@ def run(
         seed_torch(config.seed)
         tracker = _make_tracker(dataset, model, config)
 
-        folder.create()
+        folder.create(_arguments(options))
         try:
             write_log_to(log, folder / "log.txt")
             write_text(folder / "config.yaml", _settings_text(options, config))
@@ -221,10 +221,24 @@ def _reported_options(options: RunOptions, tracked: Tracked) -> dict[str, object
     return {**asked, "camera_file": options.camera_file is not None, "interrupted": tracked.interrupted}
 
 
+def _arguments(options: RunOptions) -> list[str]:
+    """What the command line was given beside the settings and the place of the results."""
+    arguments = [str(options.sequence)]
+    if options.camera_file is not None:
+        arguments += ["--camera", str(options.camera_file)]
+    if options.max_frames is not None:
+        arguments += ["--max-frames", str(options.max_frames)]
+    if options.stride != 1:
+        arguments += ["--stride", str(options.stride)]
+    return arguments if options.mesh else [*arguments, "--no-mesh"]
+
+
 def _settings_text(options: RunOptions, config: Config) -> str:
+    camera = "none" if options.camera_file is None else Path(options.camera_file).name
     lines = [
-        "# The settings of this run; 'slamdepth run SEQ --config' reads them back.",
-        f"# sequence: {Path(options.sequence).name}",
+        "# The settings of this run; 'slamdepth run SEQ --config' reads them back. These are not read back:",
+        f"# sequence: {Path(options.sequence).name}, --camera: {camera}",
         f"# stride: {options.stride}, max frames: {options.max_frames}, mesh: {options.mesh}",
+        "# For the same run again give them anew; README.txt has the command.",
     ]
     return "\n".join(lines) + "\n" + config.to_yaml()
