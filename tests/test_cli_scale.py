@@ -81,6 +81,18 @@ def test_a_scale_is_fitted_kept_and_applied(tiny_room: Path, tmp_path: Path) -> 
     assert "was fitted with other weights of 'flat'" in other.stderr
 
 
+def test_a_broken_off_fit_says_that_nothing_is_kept(
+    tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(model: ConstantDepth, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ConstantDepth, "predict", interrupt)
+    done = call("scale", tiny_room, "--depth", "flat", "--output", tmp_path / "scale.yaml")
+    assert (done.returncode, done.stderr) == (130, "error: interrupted: nothing was written\n")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_scale_of_an_earlier_call_is_replaced(tiny_room: Path, tmp_path: Path) -> None:
     file = tmp_path / "scale.yaml"
     for frames in (1, 2):

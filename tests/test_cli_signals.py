@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import time
@@ -69,3 +70,25 @@ def test_after_a_kill_the_online_trajectory_is_readable(long_room: Path, tmp_pat
     assert (folder / "config.yaml").exists()
     assert "frames" in (folder / "log.txt").read_text()
     assert not (folder / "trajectory.txt").exists()
+
+
+def test_a_broken_off_rendering_says_that_it_goes_on(tmp_path: Path) -> None:
+    out = tmp_path / "room"
+    arguments = command("synth", out, "--frames", 4000, "--width", 64, "--height", 48)
+    process = subprocess.Popen(arguments, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+    deadline_s = time.monotonic() + PATIENCE_S
+    while len(list(out.glob("rgb/*.png"))) < 3:
+        if process.poll() is not None or time.monotonic() > deadline_s:
+            process.kill()
+            pytest.fail(f"the rendering did not start: {process.communicate()[1]}")
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130
+    told = re.fullmatch(
+        rf"error: interrupted: (\d+) of 4000 frames are kept in {re.escape(str(out))}; "
+        "the same command goes on\n",
+        stderr,
+    )
+    assert told is not None, stderr
+    assert abs(len(list(out.glob("rgb/*.png"))) - int(told[1])) <= 1

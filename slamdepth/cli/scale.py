@@ -17,6 +17,7 @@ from slamdepth.cli.options import (
     MaxFramesOption,
     StrideOption,
 )
+from slamdepth.cli.signals import telling_what_is_kept
 
 
 def scale_command(
@@ -75,7 +76,10 @@ def scale_command(
     model = create_depth_model(depth, device=device, weights=depth_weights)
     check_can_fit(model, shift)
     err = error_console()
-    with Progress(console=err, transient=True, disable=quiet or not err.is_terminal) as bar:
+    with (
+        telling_what_is_kept(lambda: "nothing was written"),
+        Progress(console=err, transient=True, disable=quiet or not err.is_terminal) as bar,
+    ):
         task = bar.add_task("fitting the scale")
         frames = read_with_depth(
             dataset,

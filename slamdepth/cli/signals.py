@@ -5,12 +5,33 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from slamdepth.errors import SlamdepthError
+
 if TYPE_CHECKING:
     from types import FrameType
+
+
+class Interrupted(SlamdepthError):
+    """The user broke a command off."""
+
+    exit_code = 130
+
+
+@contextmanager
+def telling_what_is_kept(kept: Callable[[], str]) -> Iterator[None]:
+    """Ctrl-C ends the block at once; what ``kept`` says is then left is told in one line.
+
+    Raises:
+        Interrupted: Ctrl-C was pressed.
+    """
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        raise Interrupted(f"interrupted: {kept()}") from interrupt
 
 
 @contextmanager

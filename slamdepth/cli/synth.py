@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
+from slamdepth.cli.signals import telling_what_is_kept
 
 
 def synth_command(
@@ -56,9 +57,25 @@ def synth_command(
     settings = SynthSettings.from_dict(
         {name: value for name, value in asked.items() if value is not None}, origin="command line"
     )
+    done = 0
     err = error_console()
-    with Progress(console=err, transient=True, disable=quiet or not err.is_terminal) as bar:
+
+    def kept() -> str:
+        if done == 0:
+            return "no frame was rendered"
+        return f"{done} of {settings.frames} frames are kept in {output}; the same command goes on"
+
+    with (
+        telling_what_is_kept(kept),
+        Progress(console=err, transient=True, disable=quiet or not err.is_terminal) as bar,
+    ):
         task = bar.add_task("rendering", total=settings.frames)
-        folder = render_sequence(output, settings, lambda done, total: bar.update(task, completed=done))
+
+        def show(frames_done: int, total: int) -> None:
+            nonlocal done
+            done = frames_done
+            bar.update(task, completed=done)
+
+        folder = render_sequence(output, settings, show)
     if not quiet:
-        console().print(f"{settings.frames} frames in {folder}", markup=False)
+        console().print(f"{settings.frames} frames in {folder}", markup=False, soft_wrap=True)
