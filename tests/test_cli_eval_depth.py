@@ -14,6 +14,8 @@ from command_line import call
 from training_places import make_tum
 
 from slamdepth.depth import registry
+from slamdepth.depth.sensor import SensorDepth
+from slamdepth.errors import ConfigError
 from slamdepth.pipeline.depth_data import open_depth_data, readable, thinned
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
@@ -66,6 +68,7 @@ def test_a_sequence_and_training_pairs_together(tiny_room: Path, pairs: Path, tm
         assert set(judged["ways"]) == {"as_predicted", "sequence_median", "frame_median", "frame_affine"}
         assert judged["ways"]["as_predicted"]["abs_rel"]["value"] == 0.0
         assert judged["ways"]["as_predicted"]["edge_f1"]["value"] == 1.0
+    assert (figures["complete"], figures["not_judged"]) == (True, [])
     assert figures["mean_over_sets"]["as_predicted"]["delta1"] == 1.0
     assert figures["versions"]["slamdepth"]
     for picture in ("judged_over_depth.png", f"judged_{tiny_room.name}.png", "judged_corner.png"):
@@ -110,6 +113,39 @@ def test_what_is_wrong_is_one_line(tiny_room: Path, pairs: Path, tmp_path: Path)
         assert done.returncode != 0
         assert len(done.stderr.strip().splitlines()) == 1, done.stderr
         assert said in done.stderr
+
+
+@pytest.mark.parametrize("ending", ["error", "Ctrl-C"])
+def test_what_was_judged_before_an_end_is_written(
+    ending: str, pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second data set cannot be judged, or the user has had enough."""
+    second = shutil.copytree(pairs, tmp_path / "second")
+    third = shutil.copytree(pairs, tmp_path / "third")
+    output = tmp_path / "judged.json"
+    raised = ConfigError("made up") if ending == "error" else KeyboardInterrupt()
+    looked: list[int] = []
+
+    def predict(model: SensorDepth, frame: Frame) -> DepthPrediction:
+        looked.append(frame.index)
+        if len(looked) > 3:
+            raise raised
+        return measure(model, frame)
+
+    measure = SensorDepth.predict
+    monkeypatch.setattr(SensorDepth, "predict", predict)
+    done = call("eval-depth", "sensor", pairs, second, third, "-o", output)
+    figures = json.loads(output.read_text())
+    assert list(figures["data"]) == ["corner"]
+    assert (figures["complete"], figures["not_judged"]) == (False, ["second", "third"])
+    assert (tmp_path / "judged_corner.png").is_file()
+    kept = f"{output} has the 1 of 3 data sets judged so far"
+    if ending == "error":
+        assert (done.returncode, done.stderr) == (2, "error: made up\n")
+        assert f"figures: {kept}\n" in done.stdout
+    else:
+        assert (done.returncode, done.stderr) == (130, f"error: interrupted: {kept}\n")
+        assert call("eval-depth", "sensor", pairs).stderr == "error: interrupted: nothing was written\n"
 
 
 def test_figures_of_an_earlier_call_are_replaced(pairs: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
 from slamdepth.cli.options import CameraOption, DepthWeightsOption, DeviceOption
+from slamdepth.cli.signals import Interrupted, telling_what_is_kept
 
 if TYPE_CHECKING:
     from slamdepth.depth.base import DepthModel
@@ -29,7 +30,8 @@ def eval_depth_command(
         list[Path],
         typer.Argument(
             metavar="DATA",
-            help="Sequences with sensor depth, training pairs, Hypersim scenes, or folders of those.",
+            help="Sequences with sensor depth, training pairs or Hypersim scenes; of the latter two also a "
+            "folder that holds several.",
         ),
     ],
     depth_weights: DepthWeightsOption = None,
@@ -57,7 +59,7 @@ def eval_depth_command(
     """
     show_log()
     from slamdepth.depth.registry import create_depth_model
-    from slamdepth.errors import ConfigError
+    from slamdepth.errors import ConfigError, SlamdepthError
     from slamdepth.evaluation import Interval, mean_over_sets
     from slamdepth.pipeline.depth_data import open_depth_data, thinned
     from slamdepth.pipeline.folder import writable_file
@@ -76,22 +78,40 @@ def eval_depth_command(
     for line in model_lines(network):
         out.print(line, markup=False, soft_wrap=True)
     judged: dict[str, DepthJudgement] = {}
-    sheets: dict[str, list[SheetRow]] = {}
-    for number, place in enumerate(places, 1):
-        name = place.name if place.name not in judged else f"{place.name}-{number}"
-        judged[name], sheets[name] = _judge(network, place, thinned(place, stride, max_frames), quiet)
-        title = f"{network.name} ({network.kind.value}) on {name}"
-        out.print(judgement_table(judged[name].ways, title))
-        for line in judgement_lines(judged[name]):
-            out.print(line, markup=False)
-    mean = mean_over_sets(list(judged.values()))
+    settings = {"stride": stride, "max_frames": max_frames, "device": device}
+    written: list[str] = []
+    pictures: dict[str, None] = {}
+
+    def kept() -> str:
+        if not written:
+            return "nothing was written"
+        return f"{output} has the {len(written)} of {len(places)} data sets judged so far"
+
+    try:
+        with telling_what_is_kept(kept):
+            for number, place in enumerate(places, 1):
+                name = place.name if place.name not in judged else f"{place.name}-{number}"
+                judged[name], sheet = _judge(network, place, thinned(place, stride, max_frames), quiet)
+                if output is not None:
+                    left = [one.name for one in places[number:]]
+                    _write_figures(output, network, settings, judged, left)
+                    written.append(name)
+                    pictures |= dict.fromkeys(_draw(output, network, name, judged, sheet))
+                out.print(
+                    judgement_table(judged[name].ways, f"{network.name} ({network.kind.value}) on {name}")
+                )
+                for line in judgement_lines(judged[name]):
+                    out.print(line, markup=False)
+    except SlamdepthError as error:
+        if written and not isinstance(error, Interrupted):
+            out.print(f"figures: {kept()}", markup=False, soft_wrap=True)
+        raise
     if len(judged) > 1:
+        mean = mean_over_sets(list(judged.values()))
         shown = {way: {name: Interval(v) for name, v in figures.items()} for way, figures in mean.items()}
         out.print(judgement_table(shown, f"mean over the {len(judged)} data sets, each counts the same"))
     if output is not None:
-        settings = {"stride": stride, "max_frames": max_frames, "device": device}
-        pictures = _write(output, network, settings, judged, sheets, mean)
-        out.print(f"figures: {output}, pictures: {', '.join(pictures)}", markup=False)
+        out.print(f"figures: {output}, pictures: {', '.join(pictures)}", markup=False, soft_wrap=True)
 
 
 def _judge(
@@ -125,26 +145,26 @@ def _judge(
     return judge_depth(model, frames, watch=watch), rows
 
 
-def _write(
+def _write_figures(
     output: Path,
     model: DepthModel,
     settings: Mapping[str, object],
-    judged: dict[str, DepthJudgement],
-    sheets: dict[str, list[SheetRow]],
-    mean: dict[str, dict[str, float]],
-) -> list[str]:
-    """The JSON file and, beside it, a sheet a data set and one plot; names of the pictures."""
+    judged: Mapping[str, DepthJudgement],
+    left: Sequence[str],
+) -> None:
+    """Write the JSON file of the data sets judged so far; those ``left`` are named in it."""
     from dataclasses import asdict
 
     from slamdepth.depth.card import card_of
+    from slamdepth.evaluation import mean_over_sets
     from slamdepth.io import write_json
-    from slamdepth.report.depth import WAY_NAMES, write_over_depth, write_sheet
     from slamdepth.report.environment import hardware, versions
-    from slamdepth.types import DepthKind
 
     write_json(
         output,
         {
+            "complete": not left,
+            "not_judged": list(left),
             "depth_model": model.name,
             "kind": model.kind,
             "card": None if (card := card_of(model)) is None else asdict(card),
@@ -152,15 +172,27 @@ def _write(
             "settings": settings,
             "versions": versions(),
             "hardware": hardware(),
-            "mean_over_sets": mean,
+            "mean_over_sets": mean_over_sets(list(judged.values())),
             "data": {name: judgement.to_dict() for name, judgement in judged.items()},
         },
     )
-    scaled = WAY_NAMES["frame_median" if model.kind is DepthKind.METRIC else "frame_affine"]
+
+
+def _draw(
+    output: Path,
+    model: DepthModel,
+    name: str,
+    judged: Mapping[str, DepthJudgement],
+    sheet: Sequence[SheetRow],
+) -> list[str]:
+    """Beside the JSON file one plot of all data sets so far and a sheet of ``name``; their names."""
+    from slamdepth.report.depth import WAY_NAMES, write_over_depth, write_sheet
+    from slamdepth.types import DepthKind
+
     pictures = [output.with_name(f"{output.stem}_over_depth.png")]
     write_over_depth(pictures[0], judged, model.name)
-    for name, rows in sheets.items():
-        if rows:
-            pictures.append(output.with_name(f"{output.stem}_{name}.png"))
-            write_sheet(pictures[-1], rows, scaled, f"{model.name} on {name}")
+    if sheet:
+        scaled = WAY_NAMES["frame_median" if model.kind is DepthKind.METRIC else "frame_affine"]
+        pictures.append(output.with_name(f"{output.stem}_{name}.png"))
+        write_sheet(pictures[1], sheet, scaled, f"{model.name} on {name}")
     return [picture.name for picture in pictures]
