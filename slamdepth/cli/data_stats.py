@@ -19,7 +19,8 @@ def data_stats_command(
         list[Path],
         typer.Argument(
             metavar="DATA",
-            help="Sequences with sensor depth, training pairs, Hypersim scenes, or folders of those.",
+            help="Sequences with sensor depth, training pairs or Hypersim scenes; of the latter two also a "
+            "folder that holds several.",
         ),
     ],
     output: Annotated[
