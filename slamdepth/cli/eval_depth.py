@@ -186,13 +186,13 @@ def _draw(
     sheet: Sequence[SheetRow],
 ) -> list[str]:
     """Beside the JSON file one plot of all data sets so far and a sheet of ``name``; their names."""
-    from slamdepth.report.depth import WAY_NAMES, write_over_depth, write_sheet
+    from slamdepth.report.depth import write_over_depth, write_sheet
     from slamdepth.types import DepthKind
 
     pictures = [output.with_name(f"{output.stem}_over_depth.png")]
     write_over_depth(pictures[0], judged, model.name)
     if sheet:
-        scaled = WAY_NAMES["frame_median" if model.kind is DepthKind.METRIC else "frame_affine"]
+        scaled = f"after each frame's {'median' if model.kind is DepthKind.METRIC else 'affine fit'}"
         pictures.append(output.with_name(f"{output.stem}_{name}.png"))
         write_sheet(pictures[1], sheet, scaled, f"{model.name} on {name}")
     return [picture.name for picture in pictures]

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,6 +40,15 @@ _FIGURE_NAMES = {
     "edge_error_px": ("edge err., px", 2),
 }
 _ERROR_SHOWN = 0.5
+_LEAST_SHARE = 0.001  # of a data set's pixels, for a depth to be drawn
+_CURVES = {
+    "as_predicted": ("-", "as predicted"),
+    "frame_median": ("--", "after each frame's median: one factor"),
+    "frame_affine": (":", "after each frame's affine fit: factor and shift"),
+}
+_DOUBLING = tuple(2.0**k for k in range(-6, 9))
+_BETWEEN = tuple(1.5 * place for place in _DOUBLING)
+_AROUND_ONE = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 1.75, 2.0, 2.5)
 
 
 @dataclass(frozen=True)
@@ -115,7 +124,7 @@ def write_sheet(path: Path, rows: Sequence[SheetRow], scaled: str, title: str) -
     """Image, sensor depth, predicted depth and its relative error, a row a frame, as PNG.
 
     Args:
-        scaled: how ``predicted_m`` was scaled, for the heading.
+        scaled: how ``predicted_m`` was scaled, for the heading, such as "after each frame's median".
 
     Raises:
         OutputError: the file cannot be written.
@@ -140,10 +149,13 @@ def write_sheet(path: Path, rows: Sequence[SheetRow], scaled: str, title: str) -
         line[3].set_facecolor(UNKNOWN)
         for axis in line:
             axis.set(xticks=[], yticks=[])
-    for axis, name in zip(axes[0], ("image", "sensor", f"predicted, {scaled}", "error"), strict=True):
+    heads = ("image", "sensor", f"predicted, {scaled}", "its error: red too far, blue too near")
+    for axis, name in zip(axes[0], heads, strict=True):
         axis.set_title(name, fontsize=9)
     figure.colorbar(metres, ax=axes[:, 1:3].ravel().tolist(), label="depth, m", shrink=0.8)
-    figure.colorbar(share, ax=axes[:, 3].tolist(), label="error, %", shrink=0.8)
+    figure.colorbar(share, ax=axes[:, 3].tolist(), extend="both", shrink=0.8).set_label(
+        f"error, % (±{100 * _ERROR_SHOWN:.0f}: that or more)", fontsize=8
+    )
     figure.suptitle(title, fontsize=10)
     write_png(figure, path)
 
@@ -151,37 +163,65 @@ def write_sheet(path: Path, rows: Sequence[SheetRow], scaled: str, title: str) -
 def write_over_depth(path: Path, judgements: Mapping[str, DepthJudgement], title: str) -> None:
     """AbsRel and bias over the sensor's depth, a colour a data set, as PNG.
 
+    Depths at which a data set has hardly a pixel are left out.
+
     Raises:
         OutputError: the file cannot be written.
     """
-    from matplotlib.ticker import StrMethodFormatter
+    from matplotlib.lines import Line2D
 
     figure, axes = new_figure(8, 8, 3, 1, sharex=True, height_ratios=(3, 2, 1))
     errors, bias, shares = axes[:, 0]
-    styles = {"as_predicted": "-", "frame_median": "--", "frame_affine": ":"}
-    for colour, (name, judgement) in enumerate(judgements.items()):
+    drawn: set[str] = set()
+    near, far = math.inf, 0.0
+    for colour, judgement in enumerate(judgements.values()):
         over = judgement.over_depth
-        centres = np.sqrt(np.array(over.edges_m[1:]) * np.array(over.edges_m[:-1]))
-        for way, style in styles.items():
+        edges, pixels = np.array(over.edges_m), np.array(over.pixels, dtype=float)
+        share = pixels / pixels.sum()
+        kept = share >= _LEAST_SHARE
+        near, far = min(near, edges[:-1][kept].min()), max(far, edges[1:][kept].max())
+        centres = np.sqrt(edges[1:] * edges[:-1])
+        for way, (style, _) in _CURVES.items():
             if way in over.abs_rel:
-                label = f"{name}, {WAY_NAMES[way]}"
-                errors.plot(centres, _floats(over.abs_rel[way]), style, color=f"C{colour}", label=label)
-                bias.plot(centres, np.exp(_floats(over.log_bias[way])), style, color=f"C{colour}")
-        pixels = np.array(over.pixels, dtype=float)
-        shares.plot(centres, pixels / pixels.sum(), color=f"C{colour}")
-    errors.set(ylabel="AbsRel", xscale="log", ylim=(0, None), title=title)
-    errors.legend(fontsize="x-small")
+                drawn.add(way)
+                error, log_bias = (
+                    np.where(kept, _floats(values[way]), np.nan) for values in (over.abs_rel, over.log_bias)
+                )
+                errors.plot(centres, error, style, color=f"C{colour}")
+                bias.plot(centres, np.exp(log_bias), style, color=f"C{colour}")
+        shares.plot(centres, share, color=f"C{colour}")
+    errors.set(ylabel="AbsRel: mean of |predicted - sensor| / sensor", xscale="log", ylim=(0, None))
+    errors.set_title(title)
+    errors.legend(
+        handles=[
+            *(Line2D([], [], color=f"C{colour}", label=name) for colour, name in enumerate(judgements)),
+            *(
+                Line2D([], [], color="grey", linestyle=style, label=what)
+                for way, (style, what) in _CURVES.items()
+                if way in drawn
+            ),
+        ],
+        fontsize="x-small",
+    )
     bias.axhline(1.0, color="grey", lw=0.8)
-    bias.set(ylabel="predicted / sensor", yscale="log")
-    shares.set(ylabel="share of pixels", xlabel="depth by the sensor, m", ylim=(0, None))
+    bias.set(ylabel="predicted / sensor\n(above 1: too far)", yscale="log")
+    shares.set(ylabel="share of pixels", xlabel="depth by the sensor, m", ylim=(0, None), xlim=(near, far))
     for axis in (errors, bias, shares):
-        axis.grid(visible=True, which="both", alpha=0.3)
-    for scale in (shares.xaxis, bias.yaxis):
-        scale.set_major_formatter(StrMethodFormatter("{x:g}"))
-        scale.set_minor_formatter(StrMethodFormatter("{x:g}"))
-    shares.tick_params(axis="x", which="minor", labelsize="x-small")
-    bias.tick_params(axis="y", which="minor", labelsize="x-small")
+        axis.grid(visible=True, which="major", alpha=0.3)
+    ratios = np.concatenate([[0.9, 1.1], *(line.get_ydata() for line in bias.lines)])
+    low, high = 0.97 * np.nanmin(ratios), 1.03 * np.nanmax(ratios)
+    bias.set_ylim(low, high)
+    _set_ticks(shares.xaxis, _DOUBLING if far / near > 16 else sorted((*_DOUBLING, *_BETWEEN)))
+    _set_ticks(bias.yaxis, _AROUND_ONE if high / low < 3 else _DOUBLING)
     write_png(figure, path)
+
+
+def _set_ticks(axis: Any, places: Sequence[float]) -> None:
+    from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
+
+    axis.set_major_locator(FixedLocator(places))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
 
 
 def _floats(values: Sequence[float | None]) -> NDArray[np.float64]:
