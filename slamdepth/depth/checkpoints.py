@@ -140,4 +140,6 @@ def check_device_name(device: str) -> None:
         ConfigError: it does not.
     """
     if not re.fullmatch(r"cpu|cuda(:(0|[1-9][0-9]*))?", device):
-        raise ConfigError(f"unknown device '{device}'; choose from: cpu, cuda, cuda:N (the Nth CUDA device)")
+        raise ConfigError(
+            f"unknown device '{device}'; choose from: cpu, cuda, cuda:N (CUDA device N, from 0)"
+        )
