@@ -14,7 +14,7 @@ from made_up import MadeUpDataset, MadeUpTracker
 from slamdepth.config import Config
 from slamdepth.errors import CameraError, ConfigError, DatasetError, ImageDecodeError
 from slamdepth.io import read_tum_trajectory
-from slamdepth.pipeline import RunInterrupted, RunOptions, RunProgress, Stage
+from slamdepth.pipeline import RunInterrupted, RunOptions, RunProgress, Stage, tracking
 from slamdepth.pipeline.prefetch import FramePrefetcher, ReadFrame
 from slamdepth.pipeline.run import _settings_text
 from slamdepth.pipeline.tracking import Tracked, track
@@ -166,3 +166,14 @@ def test_the_settings_file_gives_the_same_settings_again(tmp_path: Path) -> None
     config = Config.from_dict({"seed": 7, "map": {"voxel_size_m": 0.05}, "odometry": "kiss-icp"})
     (tmp_path / "config.yaml").write_text(_settings_text(RunOptions(Path("s"), max_frames=3), config))
     assert Config.from_yaml(tmp_path / "config.yaml") == config
+
+
+@pytest.mark.parametrize(("broken", "told"), [(5, 0), (6, 1), (9, 1)])
+def test_counting_is_told_only_where_more_images_follow(
+    broken: int, told: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING, "slamdepth"):
+        for number in range(1, broken + 1):
+            tracking._warn(ImageDecodeError(f"{number}.png: cannot be read"), number)
+    assert caplog.text.count("are only counted") == told
+    assert caplog.text.count("image skipped: ") == min(broken, 5)

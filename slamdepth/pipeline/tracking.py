@@ -39,7 +39,7 @@ class Tracked:
 
     Attributes:
         fps: frames over the wall time from the first step to the end of the optimisation.
-        skipped: images that did not decode.
+        skipped: images that did not decode or are missing.
         interrupted: True where it was stopped before the last frame.
         notes: what a reader of the report should know, one line each.
     """
@@ -116,7 +116,7 @@ def track(
     if done < total:
         notes.append(f"interrupted after {done} of {total} frames")
     if skipped:
-        notes.append(f"{skipped} of {total} images do not decode and were skipped")
+        notes.append(f"{skipped} of {total} images do not decode or are missing, and were skipped")
     if reader.broken_depth_images:
         notes.append(f"{reader.broken_depth_images} depth images do not decode and were left out")
     for note in notes:
@@ -133,9 +133,9 @@ def track(
 
 def _warn(error: ImageDecodeError, count: int) -> None:
     level = logging.WARNING if count <= _WARNINGS else logging.DEBUG
+    if count == _WARNINGS + 1:
+        logger.warning("further images that cannot be read are only counted")
     logger.log(level, "image skipped: %s", error)
-    if count == _WARNINGS:
-        logger.warning("further images that do not decode are only counted")
 
 
 def _state(result: StepResult, done: int, total: int, frames: int, start_s: float) -> RunProgress:
