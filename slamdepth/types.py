@@ -21,6 +21,8 @@ from slamdepth.errors import CameraError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+_UNIT_TOLERANCE = 0.01
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -121,6 +123,9 @@ class Frame:
             image, 0 where unknown; None where the sequence has none.
         gravity: ``(3,)`` unit direction of gravity in the camera's frame (x right, y down, z forward), as an
             accelerometer tells it; None where it is not known. Depth models may use it.
+
+    Raises:
+        CameraError: an image is not of the camera's size, or gravity is no unit direction (to 1 %).
     """
 
     index: int
@@ -141,6 +146,20 @@ class Frame:
             raise CameraError(
                 f"frame {self.index}: depth is {self.depth_m.shape}, the colour image {expected[:2]}"
             )
+        if self.gravity is not None:
+            _check_gravity(self.index, self.gravity)
+
+
+def _check_gravity(index: int, gravity: NDArray[np.float64]) -> None:
+    if not isinstance(gravity, np.ndarray) or gravity.shape != (3,) or gravity.dtype.kind not in "fiu":
+        what = f"{gravity.shape} {gravity.dtype}" if isinstance(gravity, np.ndarray) else repr(gravity)[:60]
+        raise CameraError(f"frame {index}: gravity must be an array of three numbers x y z, got {what}")
+    length = float(np.linalg.norm(gravity.astype(np.float64)))
+    if not abs(length - 1.0) <= _UNIT_TOLERANCE:  # written so that NaN is refused
+        raise CameraError(
+            f"frame {index}: gravity must be a unit direction, its length is {length:g}: divide what the "
+            "accelerometer says by its length, or leave it None"
+        )
 
 
 class DepthKind(str, Enum):
