@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from slamdepth.datasets import read_camera, write_camera
+from slamdepth.datasets.camera_check import check_plausible
 from slamdepth.errors import CameraError
 from slamdepth.types import Camera
 
@@ -48,8 +49,45 @@ anything = st.floats(-1e5, 1e5)
     )
 )
 def test_round_trip(tmp_path: Path, camera: Camera) -> None:
+    """To the bit, or refused by name: never another camera."""
+    path = tmp_path / "camera.yaml"
+    write_camera(path, camera)
+    refusal = refused(camera)
+    if refusal is None:
+        assert read_camera(path) == camera
+    else:
+        with pytest.raises(CameraError) as caught:
+            read_camera(path)
+        assert str(caught.value) == f"{path}: {refusal}"
+
+
+def refused(camera: Camera) -> str | None:
+    try:
+        check_plausible(camera)
+    except CameraError as error:
+        return str(error)
+    return None
+
+
+@st.composite
+def real_cameras(draw: st.DrawFn) -> Camera:
+    width, height = draw(st.integers(1, 10000)), draw(st.integers(1, 10000))
+    focal = st.floats(0.8, 3.0).map(lambda share: share * max(width, height))
+    middle, weak = st.floats(0.4, 0.6), st.floats(0.0, 0.1)
+    return Camera(
+        width, height, draw(focal), draw(focal), draw(middle) * width - 0.5, draw(middle) * height - 0.5,
+        (draw(weak), draw(weak), draw(weak) / 100, -draw(weak) / 100, draw(weak)),
+        draw(positive), draw(positive),
+    )  # fmt: skip
+
+
+@RELAXED
+@given(real_cameras())
+def test_round_trip_of_plausible_cameras(tmp_path: Path, camera: Camera) -> None:
     write_camera(tmp_path / "camera.yaml", camera)
-    assert read_camera(tmp_path / "camera.yaml") == camera
+    notes: list[str] = []
+    assert read_camera(tmp_path / "camera.yaml", notes) == camera
+    assert notes == []
 
 
 @pytest.mark.parametrize(
@@ -72,6 +110,12 @@ def test_round_trip(tmp_path: Path, camera: Camera) -> None:
         (GOOD + "distortion: [1, 2, 3, 4, x]\n", "key 'distortion' must be a number"),
         (GOOD + "depth_factor: 0\n", "depth_factor and fps must be positive"),
         (GOOD + "fx: 501\n", "key 'fx' is given twice"),
+        (GOOD.replace("320", "3000"), "cx 3000 lies outside the image, whose width is 640"),
+        (GOOD.replace("240", "-1"), "cy -1 lies outside the image, whose height is 480"),
+        (
+            GOOD + "distortion: [50, .2, 0, 0, 100]\n",
+            "distortion [50, 0.2, 0, 0, 100] (k1 k2 p1 p2 k3) cannot be un",
+        ),
         ("", "expected lines 'key: value'"),
         ("- 1\n", "expected lines 'key: value'"),
         ("width: [\n", "not valid YAML"),

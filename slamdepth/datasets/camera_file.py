@@ -16,29 +16,49 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from slamdepth.datasets.camera_check import check_plausible
 from slamdepth.errors import CameraError
 from slamdepth.io import write_text
 from slamdepth.types import Camera
+
+_log = logging.getLogger(__name__)
 
 CAMERA_FILE = "camera.yaml"
 REQUIRED_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 OPTIONAL_KEYS = ("distortion", "depth_factor", "fps")
 
 
-def read_camera(path: str | Path) -> Camera:
+def read_camera(path: str | Path, notes: list[str] | None = None) -> Camera:
     """Read a ``camera.yaml``.
 
+    Args:
+        notes: takes a line for whatever is unusual in it; None: it is logged as a warning.
+
     Raises:
-        CameraError: the file is missing or no YAML, or a key is missing, unknown, given
-            twice or of a wrong type; names the file, the key and the allowed ones.
+        CameraError: the file is missing or no YAML, a key is missing, unknown, given twice or of a wrong
+            type, or no camera has such intrinsics; names the file, the key and the allowed ones.
     """
     path = Path(path)
-    values = _load(path)
+    camera = _parse(path, _load(path))
+    try:
+        unusual = [f"{path.name}: {note}" for note in check_plausible(camera)]
+    except CameraError as error:
+        raise CameraError(f"{path}: {error}") from error
+    if notes is None:
+        for note in unusual:
+            _log.warning("%s", note)
+    else:
+        notes += unusual
+    return camera
+
+
+def _parse(path: Path, values: dict[Any, Any]) -> Camera:
     allowed = REQUIRED_KEYS + OPTIONAL_KEYS
     unknown = [key for key in values if key not in allowed]
     if unknown:
@@ -73,7 +93,7 @@ def what_to_write(width: int, height: int) -> str:
 
 
 def write_camera(path: str | Path, camera: Camera) -> None:
-    """Write ``camera`` so that :func:`read_camera` gives back an equal one.
+    """Write ``camera`` so that :func:`read_camera` gives back an equal one, should it be a plausible one.
 
     Raises:
         OutputError: ``path`` cannot be written.

@@ -86,12 +86,14 @@ def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dat
         if not path.exists():
             what = "video file" if path.suffix.lower() in VIDEO_ENDINGS else "folder"
             raise DatasetError(f"{path}: no such {what}")
-        camera = None if camera_file is None else read_camera(Path(camera_file).expanduser())
+        camera_notes: list[str] = []
+        camera = None if camera_file is None else read_camera(Path(camera_file).expanduser(), camera_notes)
         readers = known_readers()
         for reader in readers:
             if reader.matches(path):
                 _log.info("%s: reading as layout '%s'", path, reader.name)
                 dataset = reader.open(path, camera)
+                dataset.notes[:0] = camera_notes
                 for note in dataset.notes:
                     _log.info("%s: %s", dataset.name, note)
                 return dataset

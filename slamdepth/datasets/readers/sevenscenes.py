@@ -142,7 +142,7 @@ def _read_poses(
 
 def _find_camera(path: Path, camera: Camera | None, notes: list[str]) -> Camera:
     if camera is None and (path / CAMERA_FILE).exists():
-        camera = read_camera(path / CAMERA_FILE)
+        camera = read_camera(path / CAMERA_FILE, notes)
     if camera is None:
         notes.append(
             "intrinsics 585 585 320 240 known by the 7-Scenes layout; depth was never calibrated to colour"

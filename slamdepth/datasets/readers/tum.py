@@ -148,7 +148,7 @@ def _match_depth(
 def _find_camera(path: Path, image_shape: tuple[int, ...], notes: list[str]) -> Camera:
     camera_path = path / CAMERA_FILE
     if camera_path.exists():
-        return read_camera(camera_path)
+        return read_camera(camera_path, notes)
     for name in (path.name, path.resolve().name):  # the second for '.' and links
         camera = known_camera(name)
         if camera is not None:

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the intrinsics in a camera file can be those of a camera, beyond what :class:`Camera` asks.
+
+Cameras that the library makes itself, of cut or turned views, need not pass: only what people write does.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.errors import CameraError
+from slamdepth.types import Camera
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+WIDE_VIEW_DEG = 120.0
+"""Wider than a pinhole camera with Brown-Conrady distortion usually sees."""
+
+_UNDONE_SHARE = 0.05
+"""Of the longer side: real lenses come back to 0.2 % of it, those whose inverse diverges to 10 % and more."""
+
+_STRONGEST, _NEGLIGIBLE = 1e4, 1e-12
+"""Bounds within which a coefficient can be reckoned with."""
+
+
+def check_plausible(camera: Camera) -> list[str]:
+    """Refuse intrinsics that no camera has, and say what is unusual, a line each.
+
+    Raises:
+        CameraError: the principal point lies outside the image, or the distortion folds it or cannot be
+            undone; without the name of the file.
+    """
+    _check_principal_point(camera)
+    _check_distortion(camera)
+    view_deg = horizontal_view_deg(camera)
+    if view_deg <= WIDE_VIEW_DEG:
+        return []
+    return [
+        f"fx {camera.fx:g} is a horizontal view of {view_deg:.0f} degrees in an image {camera.width} pixels "
+        "wide: if the camera sees less, fx, fy, cx and cy are of images of another size"
+    ]
+
+
+def horizontal_view_deg(camera: Camera) -> float:
+    """Angle between the image's left and right edge in degrees, distortion left out."""
+    left, right = (camera.cx + 0.5) / camera.fx, (camera.width - 0.5 - camera.cx) / camera.fx
+    return math.degrees(math.atan(left) + math.atan(right))
+
+
+def fold_radius(camera: Camera) -> float:
+    """Distance from the optical axis where radial distortion turns back, as tan of the angle in the distorted
+    image; infinity where it never does."""
+    k1, k2, _, _, k3 = camera.distortion
+    slope = np.array([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])  # of r (1 + k1 r² + k2 r⁴ + k3 r⁶), in r²
+    turns = np.roots(np.where(np.abs(slope) < _NEGLIGIBLE, 0.0, slope))
+    real = turns.real[np.abs(turns.imag) <= 1e-9 * np.abs(turns)]
+    squares = real[real > 0]
+    if not len(squares):
+        return math.inf
+    r2 = float(squares.min())
+    return math.sqrt(r2) * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+
+
+def _check_principal_point(camera: Camera) -> None:
+    for name, value, size, side in (
+        ("cx", camera.cx, camera.width, "width"),
+        ("cy", camera.cy, camera.height, "height"),
+    ):
+        if not -0.5 <= value <= size - 0.5:
+            raise CameraError(
+                f"{name} {value:g} lies outside the image, whose {side} is {size}: the principal point is a "
+                "pixel near its middle; are the intrinsics of images of another size?"
+            )
+
+
+def _check_distortion(camera: Camera) -> None:
+    if not camera.is_distorted:
+        return
+    if max(map(abs, camera.distortion)) > _STRONGEST:
+        raise CameraError(f"{_named(camera)} is too strong for any lens: check the order of its numbers")
+    u = np.linspace(-0.5, camera.width - 0.5, 17)
+    v = np.linspace(-0.5, camera.height - 0.5, 13)
+    grid_px = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    offsets = (grid_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    reach = fold_radius(camera) / float(np.hypot(*offsets.T).max())
+    if reach < 1.0:
+        raise CameraError(
+            f"{_named(camera)} turns back {100 * reach:.0f} % of the way from the principal point to the "
+            "farthest corner, so what lies beyond is seen twice or never: check the order of its numbers, or "
+            "calibrate with the board in the corners and fewer coefficients"
+        )
+    with np.errstate(all="ignore"):
+        lost_px = float(np.abs(_distorted(camera, camera.undistort_points(grid_px)) - grid_px).max())
+    if not lost_px <= _UNDONE_SHARE * max(camera.width, camera.height):
+        raise CameraError(
+            f"{_named(camera)} cannot be undone, so strong is it (a pixel comes back {lost_px:.1f} pixels "
+            "from where it was): check the order of its numbers"
+        )
+
+
+def _named(camera: Camera) -> str:
+    return "distortion [" + ", ".join(f"{value:g}" for value in camera.distortion) + "] (k1 k2 p1 p2 k3)"
+
+
+def _distorted(camera: Camera, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels ``(N, 2)`` of the undistorted camera in the image as taken: Brown's model, written out."""
+    x, y = ((points_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]).T
+    k1, k2, p1, p2, k3 = camera.distortion
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    bent_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([camera.fx * bent_x + camera.cx, camera.fy * bent_y + camera.cy], axis=1)

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Intrinsics that no camera has are refused where a file says them, real ones never."""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sequences import make_sevenscenes
+
+from slamdepth.datasets import open_dataset, read_camera, write_camera
+from slamdepth.datasets.camera_check import check_plausible, fold_radius, horizontal_view_deg
+from slamdepth.datasets.readers import sevenscenes, tum
+from slamdepth.errors import CameraError
+from slamdepth.types import Camera
+
+PLAIN = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+REAL = [
+    *tum._KNOWN_CAMERAS.values(),
+    sevenscenes.CAMERA,
+    # EuRoC's cam0, OpenCV's sample, a webcam of ROS
+    Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019, 0.0000176, 0.0)),
+    Camera(640, 480, 535.9, 535.9, 342.3, 235.6, (-0.2663726, -0.0385844, 0.0017832, -0.000281, 0.2383906)),
+    Camera(640, 480, 438.783, 437.303, 305.593, 243.738, (-0.361976, 0.11051, 0.001014, 0.000505, 0.0)),
+]
+
+
+@pytest.mark.parametrize("camera", REAL)
+def test_real_cameras_pass(camera: Camera) -> None:
+    for one in (camera, camera.mirrored(), camera.scaled(320, 240), camera.without_distortion()):
+        assert check_plausible(one) == []
+
+
+def with_distortion(*distortion: float) -> Camera:
+    return Camera(640, 480, 525.0, 525.0, 319.5, 239.5, distortion)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        (Camera(640, 480, 525, 525, 639.6, 240), "cx 639.6 lies outside the image, whose width is 640"),
+        (Camera(640, 480, 525, 525, 320, -0.6), "cy -0.6 lies outside the image, whose height is 480"),
+        (with_distortion(-0.6, 0, 0, 0, 0), r"turns back 65 % of the way .* farthest corner"),
+        (with_distortion(0, 0, 0, 0, -3.0), "turns back"),
+        (with_distortion(50, 0.2, 0, 0, 100), "cannot be undone"),
+        (with_distortion(0, 0, 0.3, 0, 0), "cannot be undone"),  # tangential where k3 was meant
+        (with_distortion(0, 0, 0, 1e300, 0), "too strong"),
+    ],
+)
+def test_what_no_camera_has(camera: Camera, says: str) -> None:
+    with pytest.raises(CameraError, match=says):
+        check_plausible(camera)
+
+
+def test_the_radius_of_the_fold_is_the_largest_the_lens_reaches() -> None:
+    assert fold_radius(PLAIN) == math.inf
+    assert fold_radius(with_distortion(-0.4, 0, 0, 0, 0)) == pytest.approx(math.sqrt(1 / 1.2) * 2 / 3)
+
+
+@settings(deadline=None, max_examples=200)
+@given(*[st.floats(-2.0, 2.0)] * 3)
+def test_no_pixel_of_what_passes_is_seen_twice(k1: float, k2: float, k3: float) -> None:
+    camera = with_distortion(k1, k2, 0.0, 0.0, k3)
+    try:
+        check_plausible(camera)
+    except CameraError:
+        return
+    r = np.linspace(0.0, 10.0, 20_001)
+    reached = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
+    inside = reached[: np.argmax(reached > math.hypot(320, 240) / 525)]
+    assert len(inside)
+    assert (np.diff(inside) > 0).all()
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 5))
+def test_any_numbers_are_plausible_or_refused(distortion: tuple[float, ...]) -> None:
+    try:
+        notes = check_plausible(with_distortion(*distortion))
+    except CameraError:
+        return
+    assert notes == []
+
+
+def test_a_very_wide_view_is_noted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    wide = Camera(640, 480, 52.5, 52.5, 319.5, 239.5)
+    assert horizontal_view_deg(wide) == pytest.approx(2 * math.degrees(math.atan(320 / 52.5)))
+    assert check_plausible(Camera(640, 480, 190.0, 190.0, 319.5, 239.5)) == []
+    path = tmp_path / "camera.yaml"
+    write_camera(path, wide)
+    with caplog.at_level(logging.WARNING, logger="slamdepth"):
+        assert read_camera(path) == wide
+    said = "camera.yaml: fx 52.5 is a horizontal view of 161 degrees in an image 640 pixels wide"
+    assert said in caplog.text
+    write_camera(make_sevenscenes(tmp_path / "inside") / "camera.yaml", wide)
+    for dataset in (
+        open_dataset(tmp_path / "inside"),
+        open_dataset(make_sevenscenes(tmp_path / "seq"), path),
+    ):
+        assert dataset.notes[0].startswith(said)
