@@ -160,3 +160,22 @@ def test_importing_the_package_imports_no_reader() -> None:
     code = "import sys, slamdepth.datasets; print([m for m in sys.modules if 'readers' in m or m == 'cv2'])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+# What is of no layout
+
+
+@pytest.mark.parametrize(
+    "name", ["frame-0001.png", "frame-000001.jpg", "frame-rate.txt", "frame-1.colour.png"]
+)
+def test_the_images_of_a_film_are_not_7_scenes(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"")
+    assert not any(reader.matches(tmp_path) for reader in known_readers())
+
+
+@pytest.mark.parametrize(
+    "name", ["frame-000000.color.jpg", "frame-000000.depth.png", "frame-000000.pose.txt"]
+)
+def test_any_file_of_7_scenes_tells_the_layout(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"")
+    assert [reader.name for reader in known_readers() if reader.matches(tmp_path)] == ["7scenes"]

@@ -14,7 +14,7 @@ from sequences import CAMERA, depth_raw, image_rgb, make_tum, write_image
 
 import slamdepth.datasets
 from slamdepth.datasets import Dataset, associate, open_dataset, write_camera
-from slamdepth.datasets.readers.tum import known_camera, read_image_list
+from slamdepth.datasets.readers.tum import TumReader, known_camera, read_image_list
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
 from slamdepth.types import Camera
 
@@ -181,6 +181,26 @@ def test_missing_list(tmp_path: Path) -> None:
     folder = make_tum(tmp_path)
     (folder / "rgb.txt").unlink()
     assert "rgb.txt: missing" in error_of(folder)
+    for image in (folder / "rgb").iterdir():
+        image.unlink()
+    assert "rgb.txt: missing" in error_of(folder)  # depth.txt tells the layout
+
+
+def test_images_in_rgb_without_any_list(tmp_path: Path) -> None:
+    write_image(tmp_path / "rgb" / "0.png", image_rgb(0))
+    message = error_of(tmp_path)
+    assert "rgb.txt: missing; write a line 'seconds rgb/NAME' for each image in " in message
+    assert "README" in message
+
+
+def test_photos_with_a_folder_rgb_are_not_tum(tmp_path: Path) -> None:
+    (tmp_path / "rgb").mkdir()
+    assert not TumReader().matches(tmp_path)
+    write_image(tmp_path / "photo.jpg", image_rgb(0))
+    write_image(tmp_path / "rgb" / "0.png", image_rgb(0))
+    assert not TumReader().matches(tmp_path)
+    (tmp_path / "photo.jpg").unlink()
+    assert TumReader().matches(tmp_path)
 
 
 @pytest.mark.parametrize(

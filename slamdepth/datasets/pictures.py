@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics, exif_focal_35mm, intrinsics_of
@@ -23,8 +24,7 @@ def list_images(folder: Path) -> list[Path]:
         DatasetError: the folder cannot be read or holds no image.
     """
     try:
-        files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS]
-        images = [path for path in files if path.is_file() and not path.name.startswith(".")]
+        images = list(_images_in(folder))
     except OSError as error:
         raise DatasetError(f"{folder}: cannot be read: {error.strerror or error}") from error
     if not images:
@@ -33,10 +33,21 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(images, key=lambda path: (natural_key(path.name), path.name))
 
 
+def has_images(folder: Path) -> bool:
+    """True where ``folder`` is one, with an image in it and not only in folders below."""
+    return folder.is_dir() and next(_images_in(folder), None) is not None
+
+
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sorts names so that numbers in them count as numbers and case does not count."""
     parts = re.split(r"([0-9]+)", name.casefold())
     return [(0, int(part), "") if part[:1].isdecimal() else (1, 0, part) for part in parts if part]
+
+
+def _images_in(folder: Path) -> Iterator[Path]:
+    for path in folder.iterdir():
+        if path.suffix.lower() in IMAGE_ENDINGS and path.is_file() and not path.name.startswith("."):
+            yield path
 
 
 def short_names(images: list[Path]) -> list[str]:

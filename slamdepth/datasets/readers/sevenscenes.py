@@ -31,6 +31,7 @@ DEPTH_FACTOR = 1000.0
 UNKNOWN_RAW_DEPTH = (65535,)
 CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, depth_factor=DEPTH_FACTOR, fps=FRAME_RATE_HZ)
 
+_ENDINGS = ("color.*", "depth.png", "pose.txt")
 _COLOUR_NAME = re.compile(r"(frame-(\d+))\.color\.(png|jpg|jpeg)")
 
 
@@ -44,7 +45,8 @@ class SevenScenesReader:
     )
 
     def matches(self, path: Path) -> bool:
-        return next(path.glob("frame-*.*"), None) is not None
+        # not any frame-*: a film cut into frame-0001.png is none of it
+        return any(next(path.glob(f"frame-*.{what}"), None) for what in _ENDINGS)
 
     def open(self, path: Path, camera: Camera | None) -> ImageSequence:
         notes: list[str] = []

@@ -15,6 +15,7 @@ import numpy as np
 
 from slamdepth.datasets.association import associate
 from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera, what_to_write
+from slamdepth.datasets.pictures import has_images
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import (
     MAX_TIME_DIFFERENCE_S,
@@ -43,6 +44,7 @@ _KNOWN_CAMERAS = {
     ),
     "3": Camera(640, 480, 535.4, 539.2, 320.1, 247.6),
 }  # fmt: skip
+_LISTS = ("rgb.txt", "depth.txt", "groundtruth.txt")
 _KNOWN_NAME = re.compile(r"(?:^|[^a-z0-9])(?:freiburg|fr)([123])(?![a-z0-9])", re.IGNORECASE)
 
 
@@ -54,10 +56,17 @@ class TumReader:
     needs = "rgb.txt and the images it lists; optional depth.txt, groundtruth.txt, camera.yaml"
 
     def matches(self, path: Path) -> bool:
-        return any((path / name).exists() for name in ("rgb.txt", "depth.txt", "groundtruth.txt", "rgb"))
+        listed = any((path / name).exists() for name in _LISTS)
+        return listed or (has_images(path / "rgb") and not has_images(path))
 
     def open(self, path: Path, camera: Camera | None) -> ImageSequence:
         notes: list[str] = []
+        if not (path / "rgb.txt").exists() and has_images(path / "rgb"):
+            raise DatasetError(
+                f"{path / 'rgb.txt'}: missing; write a line 'seconds rgb/NAME' for each image in "
+                f"{path / 'rgb'}, as a command in the README does; or name that folder itself, if they were "
+                "taken at equal intervals"
+            )
         timestamps_s, image_paths = read_image_list(path / "rgb.txt")
         _check_images(path / "rgb.txt", image_paths, notes)
         sample_path, sample_shape = first_image(image_paths)
