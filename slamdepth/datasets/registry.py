@@ -49,6 +49,7 @@ class Reader(Protocol):
 
 _ReaderType = TypeVar("_ReaderType", bound=Reader)
 _readers: dict[str, Reader] = {}
+_last_reader: list[Reader] = []
 
 
 def register_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
@@ -60,8 +61,17 @@ def register_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
     return reader_type
 
 
+def register_last_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
+    """Class decorator for the :class:`Reader` that :func:`open_dataset` asks where no layout matches.
+
+    It is none of :func:`known_readers`, so whoever has an own use for folders of no layout keeps it.
+    """
+    _last_reader[:] = [reader_type()]
+    return reader_type
+
+
 def known_readers() -> tuple[Reader, ...]:
-    """Every reader, in order of its name."""
+    """The reader of every layout, in order of its name."""
     from slamdepth.datasets import readers
 
     for module in pkgutil.iter_modules(readers.__path__):
@@ -88,7 +98,7 @@ def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dat
             raise DatasetError(f"{path}: no such {what}")
         camera_notes: list[str] = []
         camera = None if camera_file is None else read_camera(Path(camera_file).expanduser(), camera_notes)
-        readers = known_readers()
+        readers = (*known_readers(), *_last_reader)
         for reader in readers:
             if reader.matches(path):
                 _log.info("%s: reading as layout '%s'", path, reader.name)

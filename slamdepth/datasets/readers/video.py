@@ -8,20 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from slamdepth.datasets.camera_file import what_to_write
 from slamdepth.datasets.registry import register_reader
+from slamdepth.datasets.resizing import reduced_camera, reduced_image
 from slamdepth.datasets.sequence import check_size
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
 from slamdepth.errors import CameraError, ImageDecodeError
 from slamdepth.types import Camera, Frame, Trajectory
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
-
-LONGEST_SIDE_PX = 640
-"""Larger frames are reduced to it: what tracking is tuned to, and fast enough on a laptop."""
 
 
 @register_reader
@@ -63,13 +60,7 @@ class VideoSequence:
         self.name, self.path = video.path.stem, video.path
         self.timestamps_s = video.timestamps_s()
         self.notes = list(video.notes)
-        share = min(1.0, LONGEST_SIDE_PX / max(video.width, video.height))
-        width, height = round(share * video.width), round(share * video.height)
-        self.camera = replace(camera.scaled(width, height), fps=video.fps)
-        if share < 1.0:
-            self.notes.append(
-                f"frames of {video.width}x{video.height} are reduced to {width}x{height} pixels"
-            )
+        self.camera = replace(reduced_camera(camera, self.notes), fps=video.fps)
         self._video = video
         self._lock = threading.Lock()
         self._frames = video.frames()
@@ -93,16 +84,10 @@ class VideoSequence:
         return Frame(index, float(self.timestamps_s[index]), image_rgb, self.camera)
 
     def _decoded(self, index: int) -> NDArray[np.uint8]:
-        import cv2
-
         if index < self._next:
             self._frames, self._next = self._video.frames(), 0
         for number, decode in self._frames:
             self._next = number + 1
             if number == index:
-                image = decode()
-                if image.shape[:2] == (self.camera.height, self.camera.width):
-                    return image
-                size = (self.camera.width, self.camera.height)
-                return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+                return reduced_image(decode(), self.camera)
         raise ImageDecodeError(f"{self.path.name}: the video ends before frame {index}")

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A plain folder of images as a sequence: taken at equal intervals, by a camera that has to be named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera, what_to_write
+from slamdepth.datasets.pictures import has_images, list_images
+from slamdepth.datasets.registry import register_last_reader
+from slamdepth.datasets.resizing import reduced_camera, reduced_image
+from slamdepth.datasets.sequence import ImageSequence, check_size, first_image
+from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
+from slamdepth.io import read_depth_raw, read_image_rgb
+from slamdepth.types import Camera, Frame
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PAIRS_FILE = "camera.json"
+"""Marks a folder of training pairs, half of whose images are depth."""
+
+
+@register_last_reader
+class ImagesReader:
+    """Opens folders of images that are of no other layout."""
+
+    name = "images"
+    needs = "a folder of images, in the order of their names; camera.yaml in it, or --camera"
+
+    def matches(self, path: Path) -> bool:
+        return has_images(path) and not (path / PAIRS_FILE).exists()
+
+    def open(self, path: Path, camera: Camera | None) -> FolderSequence:
+        notes: list[str] = []
+        images = tuple(list_images(path))
+        _check_names(path, images)
+        sample_path, sample_shape = first_image(images)
+        _check_no_depth(sample_path)
+        camera_path = path / CAMERA_FILE
+        if camera is None and camera_path.exists():
+            camera = read_camera(camera_path, notes)
+        if camera is None:
+            raise CameraError(
+                f"{path}: the intrinsics of these images are unknown: write {camera_path} or pass --camera "
+                f"FILE with {what_to_write(sample_shape[1], sample_shape[0])}"
+            )
+        check_size(sample_path, sample_shape, camera)
+        return FolderSequence(path, camera, images, notes)
+
+
+class FolderSequence(ImageSequence):
+    """The :class:`~slamdepth.datasets.base.Dataset` of a folder of images, reduced where they are large.
+
+    Args:
+        taken_by: the camera of the images as they lie there; its ``fps`` makes the times.
+        notes: takes what is assumed of them.
+    """
+
+    def __init__(self, path: Path, taken_by: Camera, images: tuple[Path, ...], notes: list[str]) -> None:
+        notes.append(
+            f"times are counted: {len(images)} images in the order of their names, {images[0].name} to "
+            f"{images[-1].name}, {taken_by.fps:g} a second (fps of the camera file, 30 where it says none)"
+        )
+        times_s: NDArray[np.float64] = np.arange(len(images)) / taken_by.fps
+        camera = reduced_camera(taken_by, notes)
+        without = (None,) * len(images)
+        super().__init__(path.resolve().name, path, camera, times_s, images, without, None, notes)
+        self._taken_by = taken_by
+
+    def read(self, index: int, *, with_depth: bool = False) -> Frame:
+        """Read one frame; see :meth:`slamdepth.datasets.base.Dataset.read`.
+
+        Raises:
+            IndexError: ``index`` is not in 0 to ``len(self) - 1``.
+            ImageDecodeError: the image does not decode.
+            CameraError: its size is not that of the camera it was taken by.
+        """
+        del with_depth
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of {len(self)}")
+        image_rgb = read_image_rgb(self.image_paths[index])
+        check_size(self.image_paths[index], image_rgb.shape, self._taken_by)
+        return Frame(
+            index, float(self.timestamps_s[index]), reduced_image(image_rgb, self.camera), self.camera
+        )
+
+
+def _check_names(path: Path, images: tuple[Path, ...]) -> None:
+    by_stem: dict[str, Path] = {}
+    for image in images:
+        other = by_stem.setdefault(image.stem, image)
+        if other is not image:
+            raise DatasetError(
+                f"{path}: {other.name} and {image.name} are one image or an image and its depth: leave only "
+                "the images of the sequence in the folder"
+            )
+
+
+def _check_no_depth(path: Path) -> None:
+    try:
+        read_depth_raw(path)
+    except ImageDecodeError:
+        return
+    raise DatasetError(
+        f"{path}: has 16 bits of grey, as depth images have; a sequence is of images of 8 bits"
+    )

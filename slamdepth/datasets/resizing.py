@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings larger than what tracking is tuned to are reduced, and their camera with them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from slamdepth.types import Camera
+
+LONGEST_SIDE_PX = 640
+"""Larger frames are reduced to it: what tracking is tuned to, and fast enough on a laptop."""
+
+
+def reduced_camera(camera: Camera, notes: list[str]) -> Camera:
+    """``camera`` for images whose longest side is at most :data:`LONGEST_SIDE_PX`.
+
+    Args:
+        notes: takes a line where that is another size.
+    """
+    share = min(1.0, LONGEST_SIDE_PX / max(camera.width, camera.height))
+    width, height = max(1, round(share * camera.width)), max(1, round(share * camera.height))
+    if share < 1.0:
+        notes.append(f"frames of {camera.width}x{camera.height} are reduced to {width}x{height} pixels")
+    return camera.scaled(width, height)
+
+
+def reduced_image(image_rgb: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """``(H, W, 3)`` uint8 at the size of ``camera``."""
+    import cv2
+
+    if image_rgb.shape[:2] == (camera.height, camera.width):
+        return image_rgb
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.resize(image_rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
