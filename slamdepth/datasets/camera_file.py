@@ -12,6 +12,8 @@
     distortion: [0.0, 0.0, 0.0, 0.0, 0.0]   # k1 k2 p1 p2 k3; may be absent
     depth_factor: 5000.0                    # raw units per metre; may be absent
     fps: 30.0                               # may be absent
+
+Files of OpenCV's and ROS's calibration are read too (:mod:`slamdepth.datasets.camera_dialects`).
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from typing import Any
 import yaml
 
 from slamdepth.datasets.camera_check import check_plausible
+from slamdepth.datasets.camera_dialects import CalibrationLoader, as_yaml, is_calibration, translated
 from slamdepth.errors import CameraError
 from slamdepth.io import write_text
 from slamdepth.types import Camera
@@ -35,27 +38,38 @@ OPTIONAL_KEYS = ("distortion", "depth_factor", "fps")
 
 
 def read_camera(path: str | Path, notes: list[str] | None = None) -> Camera:
-    """Read a ``camera.yaml``.
+    """Read a ``camera.yaml``, or a calibration as OpenCV or ROS write it.
 
     Args:
-        notes: takes a line for whatever is unusual in it; None: it is logged as a warning.
+        notes: takes a line for whatever is unusual in it, or was read from another format; None: it is
+            logged as a warning.
 
     Raises:
         CameraError: the file is missing or no YAML, a key is missing, unknown, given twice or of a wrong
             type, or no camera has such intrinsics; names the file, the key and the allowed ones.
     """
     path = Path(path)
-    camera = _parse(path, _load(path))
+    values = _load(path)
+    foreign = is_calibration(values)
+    camera = _parse(path, translated(path, values) if foreign else values)
     try:
         unusual = [f"{path.name}: {note}" for note in check_plausible(camera)]
     except CameraError as error:
         raise CameraError(f"{path}: {error}") from error
+    if foreign:
+        unusual.insert(0, f"{path.name}: a calibration of OpenCV or ROS, read as {_described(camera)}")
     if notes is None:
         for note in unusual:
             _log.warning("%s", note)
     else:
         notes += unusual
     return camera
+
+
+def _described(camera: Camera) -> str:
+    values = " ".join(f"{key} {getattr(camera, key):g}" for key in ("fx", "fy", "cx", "cy"))
+    bent = ", ".join(f"{value:g}" for value in camera.distortion)
+    return f"{camera.width}x{camera.height}, {values}, distortion [{bent}], {camera.fps:g} Hz"
 
 
 def _parse(path: Path, values: dict[Any, Any]) -> Camera:
@@ -107,22 +121,28 @@ def write_camera(path: str | Path, camera: Camera) -> None:
 
 def _load(path: Path) -> dict[Any, Any]:
     try:
-        text = path.read_bytes().decode("utf-8-sig")
-        # safe_load would let the last of two equal keys win without a word.
-        tree = yaml.compose(text, Loader=yaml.SafeLoader)
-        values = yaml.safe_load(text)
+        text = as_yaml(path.read_bytes().decode("utf-8-sig"))
+        # Loading would let the last of two equal keys win without a word.
+        tree = yaml.compose(text, Loader=CalibrationLoader)
+        values = yaml.load(text, Loader=CalibrationLoader)
     except OSError as error:
         raise CameraError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: bad UTF-8, a 13th month
-        reason = (str(error).splitlines() or ["damaged"])[0]
-        raise CameraError(f"{path}: not valid YAML: {reason}") from error
+        raise CameraError(f"{path}: not valid YAML: {_where_and_why(error)}") from error
     if not isinstance(values, dict) or not isinstance(tree, yaml.MappingNode):
         raise CameraError(f"{path}: expected lines 'key: value' with the keys {', '.join(REQUIRED_KEYS)}")
-    names = [key.value for key, _ in tree.value if isinstance(key, yaml.ScalarNode)]
-    for name in names:
-        if names.count(name) > 1:
-            raise CameraError(f"{path}: key {name!r} is given twice")
+    for mapping in (tree, *(value for _, value in tree.value if isinstance(value, yaml.MappingNode))):
+        names = [key.value for key, _ in mapping.value if isinstance(key, yaml.ScalarNode)]
+        for name in names:
+            if names.count(name) > 1:
+                raise CameraError(f"{path}: key {name!r} is given twice")
     return values
+
+
+def _where_and_why(error: Exception) -> str:
+    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+    reason = getattr(error, "problem", None) or (str(error).splitlines() or ["damaged"])[0]
+    return f"line {mark.line + 1}: {reason}" if mark is not None else reason
 
 
 def _plural(names: list[str]) -> str:
