@@ -89,8 +89,8 @@ def _check_distortion(camera: Camera) -> None:
     reach = fold_radius(camera) / float(np.hypot(*offsets.T).max())
     if reach < 1.0:
         raise CameraError(
-            f"{_named(camera)} turns back {100 * reach:.0f} % of the way from the principal point to the "
-            "farthest corner, so what lies beyond is seen twice or never: check the order of its numbers, or "
+            f"{_named(camera)} turns back {math.floor(100 * reach)} % of the way from the principal point to "
+            "the farthest corner, so what lies beyond is seen twice or never: check the order of its numbers, or "
             "calibrate with the board in the corners and fewer coefficients"
         )
     with np.errstate(all="ignore"):
