@@ -33,7 +33,7 @@ class ReportData:
         weights: every weights file that took part, and the data each has seen.
         steps: one result for each frame, in order; empty where they were not kept.
         trajectory_score, depth_score, mesh: None where there is none.
-        skipped_frames: images that could not be decoded.
+        skipped_frames: images that could not be read: damaged, or missing.
         notes: what was guessed, dropped or repaired, one line each.
         options: what was asked on the command line beside the settings.
         files: what each file of the run folder holds, by file name.

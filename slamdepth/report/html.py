@@ -89,7 +89,7 @@ def _as_predicted(summary: dict[str, Any]) -> str:
 def _notes(summary: dict[str, Any]) -> str:
     notes = list(summary["notes"])
     if summary["skipped_frames"]:
-        notes.insert(0, f"{count(summary['skipped_frames'])} images could not be decoded and were skipped")
+        notes.insert(0, f"{count(summary['skipped_frames'])} images could not be read and were skipped")
     if not notes:
         return ""
     items = "".join(f"<li>{escape(note)}</li>" for note in notes)
