@@ -34,6 +34,7 @@ from slamdepth.io import (
     write_text,
     write_tum_trajectory,
 )
+from slamdepth.io.image_end import is_cut_short
 from slamdepth.types import Trajectory
 
 RELAXED = settings(
@@ -311,6 +312,44 @@ def test_a_thumbnail_does_not_hide_the_cut(tmp_path: Path) -> None:
     path.write_bytes(whole[:-50])
     with pytest.raises(ImageDecodeError, match="cut short"):
         read_image_rgb(path)
+
+
+MOVIE = b"\x00\x00\x00\x18ftypmp42" + b"\xff\xda\xff\xd8\xff\x00" * 1000
+"""What a phone appends to a photo that moves; its bytes may be any."""
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg"])
+@pytest.mark.parametrize("appended", [MOVIE, b"\xff\xda", b"\x00" * 5000], ids=["movie", "scan", "zeros"])
+def test_what_is_appended_does_not_cut_an_image(tmp_path: Path, ending: str, appended: bytes) -> None:
+    path = tmp_path / f"i{ending}"
+    write_image(path, np.tile(image_rgb(0), (10, 10, 1)))
+    expected, whole = read_image_rgb(path), path.read_bytes()
+    path.write_bytes(whole + appended)
+    np.testing.assert_array_equal(read_image_rgb(path), expected)
+    path.write_bytes(whole[: len(whole) // 2] + MOVIE)
+    with pytest.raises(ImageDecodeError):
+        read_image_rgb(path)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 1]],
+    ids=["baseline", "progressive", "restarts"],
+)
+def test_every_cut_of_a_jpeg_is_found(options: list[int]) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (64, 80, 3), dtype=np.uint8)
+    data = cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_QUALITY, 98, *options])[1].tobytes()
+    assert b"\xff\x00" in data
+    assert not is_cut_short(data)
+    assert not is_cut_short(data + MOVIE)
+    assert all(is_cut_short(data[:length]) for length in range(3, len(data), 7))
+    assert is_cut_short(data[:-1])
+
+
+def test_every_cut_of_a_png_is_found() -> None:
+    data = cv2.imencode(".png", np.random.default_rng(0).integers(0, 256, (64, 80, 3), np.uint8))[1].tobytes()
+    assert not is_cut_short(data + b"IEND" * 2000)
+    assert all(is_cut_short(data[:length]) for length in range(8, len(data)))
 
 
 def test_no_image_and_wrong_depth_are_errors(tmp_path: Path) -> None:

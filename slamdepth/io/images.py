@@ -10,15 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.errors import ImageDecodeError, OutputError
+from slamdepth.io.image_end import is_cut_short
 from slamdepth.io.text import replacing
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-_PNG_START = b"\x89PNG\r\n\x1a\n"
-_PNG_END = b"IEND\xaeB`\x82"
-_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9"
-
 
 MILLIMETRES_END_M = 65.535
 """The farthest depth a 16-bit image in millimetres can hold."""
@@ -129,11 +125,7 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
         raise ImageDecodeError(f"{path}: cannot be read: {reason}") from error
     if not data:
         raise ImageDecodeError(f"{path}: the image is empty (0 bytes)")
-    # OpenCV fills the missing rows of a cut image with grey and says nothing. Inside a scan
-    # of a JPEG 0xff is always escaped, so the end marker behind the last scan is the real one.
-    if (data.startswith(_PNG_START) and _PNG_END not in data[-4096:]) or (
-        data.startswith(_JPEG_START) and data.rfind(_JPEG_END) < data.rfind(_JPEG_SCAN)
-    ):
+    if is_cut_short(data):
         raise ImageDecodeError(f"{path}: the image is cut short ({len(data)} bytes)")
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
