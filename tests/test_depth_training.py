@@ -127,12 +127,39 @@ def test_a_place_cannot_be_judge_and_party(settings: dict) -> None:
         ({"batch": 0}, "setting 'batch'"),
         ({"sources": []}, "setting 'sources'"),
         ({"head": {"tap": 1}}, "setting 'head.tap': unknown setting"),
+        ({"view": {"min_depth_m": 5, "max_depth_m": 1}}, "setting 'view': min_depth_m must be below"),
+        ({"view": {"min_depth_m": 10}}, "setting 'view': min_depth_m must be below max_depth_m, got 10 and"),
+        ({"coarse_epochs": 0, "fine_epochs": 0}, "setting 'fine_epochs': there must be an epoch at least"),
+        ({"learning_rate": float("inf")}, "setting 'learning_rate'"),
+        ({"loss": {"nll": float("nan")}}, "setting 'loss.nll'"),
     ],
 )
 def test_bad_settings_are_named(settings: dict, change: dict, says: str) -> None:
     with pytest.raises(ConfigError) as error:
         TrainConfig.from_dict({**settings, **change}, origin="train.yaml")
     assert str(error.value).startswith(f"train.yaml: {says}")
+
+
+def test_training_on_no_depth_is_an_error(settings: dict, caplog: pytest.LogCaptureFixture) -> None:
+    settings["view"] |= {"min_depth_m": 8.0, "max_depth_m": 9.0}
+    with pytest.raises(DatasetError, match=r"room, third: no view .* has depth between 8 and 9 m; look at"):
+        train(settings)
+    assert not Path(settings["output"]).exists()
+    assert "other: no view of it has depth between 8 and 9 m" in caplog.text
+
+
+def test_every_member_needs_depth_and_a_place_without_is_told(
+    settings: dict, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for file in (tmp_path / "data" / "third").glob("*.png"):
+        cv2.imwrite(str(file), np.zeros((48, 64), np.uint16))
+    train(settings)
+    assert "third: no view of it has depth between 0.2 and 10 m" in caplog.text
+    assert "room: no view" not in caplog.text
+    first, second = settings["sources"]
+    settings["sources"] = [{**first, "members": [0]}, {**second, "members": [1]}]
+    with pytest.raises(DatasetError, match="no view that a head is to learn from"):
+        train(settings)
 
 
 def test_settings_files(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ but which way is down."""
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class AugmentConfig(_Section):
@@ -93,6 +93,14 @@ class ViewConfig(_Section):
         description="views are turned upright by their gravity, which a place's gravity.txt or lines in "
         "the image tell",
     )
+
+    @model_validator(mode="after")
+    def _spans_depths(self) -> ViewConfig:
+        if self.min_depth_m >= self.max_depth_m:
+            raise ValueError(
+                f"min_depth_m must be below max_depth_m, got {self.min_depth_m:g} and {self.max_depth_m:g}"
+            )
+        return self
 
 
 class HeadConfig(_Section):
@@ -185,6 +193,13 @@ class TrainConfig(_Section):
     search: dict[str, SearchRange] = Field(
         {}, description="settings that --search tunes, by their dotted name, such as head.dim"
     )
+
+    @field_validator("fine_epochs")
+    @classmethod
+    def _trains_at_all(cls, fine_epochs: int, info: ValidationInfo) -> int:
+        if fine_epochs == 0 and info.data.get("coarse_epochs") == 0:
+            raise ValueError("there must be an epoch at least, and coarse_epochs is 0 too")
+        return fine_epochs
 
     @field_validator("head")
     @classmethod

@@ -46,6 +46,7 @@ from slamdepth.depth.training.data import PlaceReader
 from slamdepth.depth.training.down import learn_down
 from slamdepth.depth.training.features import FeatureCache, load_mixed_batch
 from slamdepth.depth.training.judge import held_out_figures, judge, sample_views
+from slamdepth.depth.training.known_depth import check_known_depth
 from slamdepth.depth.training.losses import taught, total_loss
 from slamdepth.depth.training.out_of_fold import COMPONENTS, learn_doubt, plan_folds
 from slamdepth.depth.training.progress import Progress, TrainStep, silent
@@ -79,7 +80,7 @@ def train_depth(
     Raises:
         ConfigError: a place is both trained on and held out, the device is not there, or there
             are not two places to learn uncertainty from.
-        DatasetError: a place is missing or malformed.
+        DatasetError: a place is missing or malformed, or no view to learn from has known depth.
         WeightsError: the backbone is missing or damaged.
         OutputError: the output cannot be written.
     """
@@ -101,6 +102,7 @@ def train_depth(
         )
         for k, plan in enumerate(planned)
     ]
+    check_known_depth(config, planned, caches, folds)
     judging = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None]
     dim = encoder.backbone.dim
     shape = head_shape(config, dim, doubt=min(COMPONENTS, dim) if folds else 0)
