@@ -20,6 +20,7 @@ from slamdepth.depth.training.config import AugmentConfig, TrainConfig
 from slamdepth.depth.training.data import data_folder, open_place
 from slamdepth.depth.training.losses import laplace_nll, multiscale_gradient, scale_invariant
 from slamdepth.depth.training.stages import coarse_target
+from slamdepth.depth.training.store import SampleStore
 from slamdepth.depth.training.views import plan_samples
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.types import Camera, Frame
@@ -112,6 +113,16 @@ def test_learning_happens(settings: dict) -> None:
     assert result.losses[0, -1] < result.losses[0, 0] - 0.2
 
 
+def test_samples_of_another_shape_are_not_stored(tmp_path: Path) -> None:
+    store = SampleStore(tmp_path, 3, {"tokens": ((2, 4), np.float16), "factor": ((), np.float32)})
+    for wrong in (np.ones(4), np.ones((2, 1, 4)), np.ones((1, 2, 4))):
+        with pytest.raises(ValueError, match=r"'tokens' is \(.*\), not \(2, 2, 4\)"):
+            store.put(range(2), factor=[1.0, 1.0], tokens=wrong)
+    store.put(range(2), factor=[1.0, 1.0], tokens=np.ones((2, 2, 4)))
+    store.commit()
+    assert store.arrays["done"].tolist() == [1, 1, 0]
+
+
 def test_a_place_cannot_be_judge_and_party(settings: dict) -> None:
     both = {**settings["sources"][0], "held_out": ["room"]}
     with pytest.raises(ConfigError, match=r"room is held out and also trained on"):
@@ -127,6 +138,11 @@ def test_a_place_cannot_be_judge_and_party(settings: dict) -> None:
         ({"batch": 0}, "setting 'batch'"),
         ({"sources": []}, "setting 'sources'"),
         ({"head": {"tap": 1}}, "setting 'head.tap': unknown setting"),
+        ({"head": {"taps": [5, 50]}}, "setting 'head.taps': must be blocks from 0 to 11"),
+        ({"head": {"taps": [-1]}}, "setting 'head.taps'"),
+        ({"head": {"taps": [5, 5]}}, "setting 'head.taps'"),
+        ({"head": {"taps": [8, 5]}}, "setting 'head.taps'"),
+        ({"head": {"taps": []}}, "setting 'head.taps'"),
         ({"view": {"min_depth_m": 5, "max_depth_m": 1}}, "setting 'view': min_depth_m must be below"),
         ({"view": {"min_depth_m": 10}}, "setting 'view': min_depth_m must be below max_depth_m, got 10 and"),
         ({"coarse_epochs": 0, "fine_epochs": 0}, "setting 'fine_epochs': there must be an epoch at least"),

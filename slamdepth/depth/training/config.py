@@ -26,6 +26,10 @@ Teaches = Literal["relief", "level", "both", "down"]
 but which way is down."""
 
 
+_BLOCKS = 12
+"""Of the backbone, a ViT-S."""
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -123,6 +127,15 @@ class HeadConfig(_Section):
         0, ge=0, le=256, description="channels of a network that finds out which way is down; 0: there is "
         "none, and the head is never told",
     )  # fmt: skip
+
+    @field_validator("taps")
+    @classmethod
+    def _are_blocks(cls, taps: tuple[int, ...]) -> tuple[int, ...]:
+        if taps != tuple(sorted(set(taps))) or not 0 <= taps[0] <= taps[-1] < _BLOCKS:
+            raise ValueError(
+                f"must be blocks from 0 to {_BLOCKS - 1}, each once, ascending; got {list(taps)}"
+            )
+        return taps
 
     @model_validator(mode="after")
     def _gravity_has_its_branch(self) -> HeadConfig:

@@ -86,7 +86,15 @@ class SampleStore:
 
     def put(self, group: range, **values: Any) -> None:
         """Write the samples ``group`` of every array, ``(len(group), ...)`` each; they count as done
-        after the next :meth:`commit`, which comes by itself every few seconds."""
+        after the next :meth:`commit`, which comes by itself every few seconds.
+
+        Raises:
+            ValueError: a value has another shape; nothing is written.
+        """
+        for name, value in values.items():
+            expected = (len(group), *self.arrays[name].shape[1:])
+            if np.shape(value) != expected:
+                raise ValueError(f"{self.folder}: '{name}' is {np.shape(value)}, not {expected}")
         for name, value in values.items():
             self.arrays[name][group.start : group.stop] = value
         self._written.append(group)
