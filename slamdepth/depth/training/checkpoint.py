@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from slamdepth.depth.training.config import TrainConfig
+from slamdepth.depth.training.output import output_path
 from slamdepth.errors import OutputError
 
 logger = logging.getLogger(__name__)
@@ -19,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 def checkpoint_path(config: TrainConfig, member: int) -> Path:
     """The checkpoint of ``member``, beside the output."""
-    output = Path(config.output)
+    output = output_path(config)
     return output.with_name(f"{output.name}.member{member}.checkpoint")
 
 

@@ -14,7 +14,6 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -49,6 +48,7 @@ from slamdepth.depth.training.judge import held_out_figures, judge, sample_views
 from slamdepth.depth.training.known_depth import check_known_depth
 from slamdepth.depth.training.losses import taught, total_loss
 from slamdepth.depth.training.out_of_fold import COMPONENTS, learn_doubt, plan_folds
+from slamdepth.depth.training.output import check_output
 from slamdepth.depth.training.progress import Progress, TrainStep, silent
 from slamdepth.depth.training.results import EpochFigures, TrainResult
 from slamdepth.depth.training.stages import FINE_COST, not_always_told, predict
@@ -82,10 +82,10 @@ def train_depth(
             are not two places to learn uncertainty from.
         DatasetError: a place is missing or malformed, or no view to learn from has known depth.
         WeightsError: the backbone is missing or damaged.
-        OutputError: the output cannot be written.
+        OutputError: the output cannot be written, or is a file that is no head.
     """
     check_device(device)
-    output = Path(config.output)
+    output = check_output(config)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

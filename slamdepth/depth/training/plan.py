@@ -23,6 +23,7 @@ from slamdepth.depth.training.features import encode, sample_specs
 from slamdepth.depth.training.loop import head_shape, steps_per_epoch
 from slamdepth.depth.training.losses import total_loss
 from slamdepth.depth.training.out_of_fold import plan_folds
+from slamdepth.depth.training.output import check_output
 from slamdepth.depth.training.stages import predict
 from slamdepth.depth.training.store import bytes_per_sample, done_on_disk
 from slamdepth.errors import WeightsError
@@ -81,8 +82,10 @@ def plan_training(
 
     Raises:
         ConfigError, DatasetError: as :func:`~slamdepth.depth.training.caches.plan_caches`.
+        OutputError: as :func:`~slamdepth.depth.training.output.check_output`.
     """
     check_device(device)
+    check_output(config)
     encoder, missing = None, None
     try:
         encoder = Encoder(backbone) if backbone is not None else open_encoder(config.backbone, device)

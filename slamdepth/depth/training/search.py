@@ -21,6 +21,7 @@ from slamdepth.depth.training.caches import Encoder, open_encoder, plan_caches
 from slamdepth.depth.training.config import SEARCHABLE, SearchRange, TrainConfig, digest
 from slamdepth.depth.training.data import PlaceReader
 from slamdepth.depth.training.loop import train_depth
+from slamdepth.depth.training.output import check_output
 from slamdepth.depth.training.progress import Progress, silent
 from slamdepth.depth.training.results import TrainResult
 from slamdepth.depth.training.store import locked
@@ -91,7 +92,7 @@ def search_settings(
     """
     _check(config)
     optuna = _optuna()
-    output = Path(config.output)
+    output = check_output(config)
     study_file = output.with_name(f"{output.stem}_search.sqlite3")
     folder = output.with_name(f"{output.stem}_search")
     encoder = Encoder(backbone) if backbone is not None else open_encoder(config.backbone, device)
