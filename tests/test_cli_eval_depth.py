@@ -15,7 +15,7 @@ from training_places import make_tum
 
 from slamdepth.depth import registry
 from slamdepth.depth.sensor import SensorDepth
-from slamdepth.errors import ConfigError
+from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.pipeline.depth_data import open_depth_data, readable, thinned
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
@@ -172,6 +172,34 @@ def test_a_folder_of_places_is_several(pairs: Path, tmp_path: Path) -> None:
     done = call("eval-depth", "sensor", tmp_path / "places", "-o", tmp_path / "judged.json")
     assert done.returncode == 0, done.stderr
     assert list(json.loads((tmp_path / "judged.json").read_text())["data"]) == ["left", "right"]
+
+
+def test_a_folder_that_cannot_be_read_is_left_out_or_named(
+    pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("left", "right"):
+        shutil.copytree(pairs, tmp_path / "places" / name)
+    real = Path.is_file
+
+    def refuse(path: Path) -> bool:
+        if path.parent.name == "left":
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path)
+
+    monkeypatch.setattr(Path, "is_file", refuse)
+    assert [place.name for place in open_depth_data(tmp_path / "places")] == ["right"]
+    assert "left: left out, cannot be read: Permission denied" in caplog.text
+    with pytest.raises(DatasetError, match="left: cannot be read: Permission denied"):
+        open_depth_data(tmp_path / "places" / "left")
+
+
+def test_an_image_of_another_size_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    folder = make_tum(tmp_path / "tum", camera, count=4)
+    (place,) = open_depth_data(folder)
+    cv2.imwrite(str(folder / "depth" / "2.png"), np.ones((24, 32), np.uint16))
+    assert [frame.timestamp_s for frame in readable(place, range(len(place)))] == [1.0, 3.0]
+    assert "frame left out: " in caplog.text
 
 
 def test_a_stride_counts_the_frames_of_the_sequence(tmp_path: Path) -> None:

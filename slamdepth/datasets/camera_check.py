@@ -90,8 +90,8 @@ def _check_distortion(camera: Camera) -> None:
     if reach < 1.0:
         raise CameraError(
             f"{_named(camera)} turns back {math.floor(100 * reach)} % of the way from the principal point to "
-            "the farthest corner, so what lies beyond is seen twice or never: check the order of its numbers, "
-            "or calibrate with the board in the corners and fewer coefficients"
+            "the farthest corner, so what lies beyond is seen twice or never: check the order of its "
+            "numbers, or calibrate with the board in the corners and fewer coefficients"
         )
     with np.errstate(all="ignore"):
         lost_px = float(np.abs(_distorted(camera, camera.undistort_points(grid_px)) - grid_px).max())

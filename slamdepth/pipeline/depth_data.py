@@ -27,24 +27,39 @@ def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
         camera: a ``camera.yaml`` for a sequence.
 
     Raises:
-        DatasetError: the folder is missing, a file, of no known kind, malformed, or has no depth.
+        DatasetError: the folder is missing, a file, not to be read, of no known kind, malformed, or has
+            no depth.
         CameraError: the intrinsics of a sequence are unknown or malformed.
     """
-    if path.is_file():
-        raise DatasetError(f"{path}: is a file; name a folder of images with depth")
-    folder = data_folder(str(path))
-    readers = known_readers().values()
-
-    def is_place(candidate: Path) -> bool:
-        return any(reader.matches(candidate) for reader in readers)
-
-    inside = (below for below in sorted(folder.glob("*")) if below.is_dir() and is_place(below))
-    places = [folder] if is_place(folder) else list(inside)
+    try:
+        if path.is_file():
+            raise DatasetError(f"{path}: is a file; name a folder of images with depth")
+        folder = data_folder(str(path))
+        is_one = _is_place(folder)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+    places = [folder] if is_one else _places_inside(folder)
     if places and camera is not None:
         raise DatasetError(f"{places[0]}: its camera is known with it; leave out --camera")
     if places:
         return [open_place(place) for place in places]
     return [SequencePlace.of(open_dataset(folder, camera))]
+
+
+def _is_place(folder: Path) -> bool:
+    return any(reader.matches(folder) for reader in known_readers().values())
+
+
+def _places_inside(folder: Path) -> list[Path]:
+    """The folders in it that are a place; one that cannot be looked into is left out with a warning."""
+    places = []
+    for below in sorted(folder.glob("*")):
+        try:
+            if below.is_dir() and _is_place(below):
+                places.append(below)
+        except OSError as error:
+            logger.warning("%s: left out, cannot be read: %s", below, error.strerror or error)
+    return places
 
 
 def thinned(place: Place, stride: int | None = None, max_frames: int | None = None) -> list[int]:

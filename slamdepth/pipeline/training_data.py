@@ -16,7 +16,7 @@ from slamdepth.datasets import Dataset, Reader, known_readers
 from slamdepth.datasets.sequence import ImageSequence, is_file
 from slamdepth.datasets.synth import SETTINGS_FILE
 from slamdepth.depth.training.data import PlaceReader, fingerprint
-from slamdepth.errors import DatasetError, ImageDecodeError
+from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
 from slamdepth.types import Camera, Frame
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class SequencePlace:
         """Frame ``index`` of those with depth; see :meth:`slamdepth.depth.training.data.Place.read`."""
         try:
             frame = self.dataset.read(self.frames[index], with_depth=True)
-        except ImageDecodeError as error:
+        except (ImageDecodeError, CameraError) as error:
             raise DatasetError(str(error)) from error
         if frame.depth_m is None:
             raise DatasetError(f"{self.dataset.path}: frame {self.frames[index]} has no depth")
