@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -11,7 +12,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from training_places import DISTANCE_M, NORMAL, make_hypersim, make_place, make_sevenscenes, make_tum
+from training_places import (
+    DISTANCE_M,
+    NORMAL,
+    make_hypersim,
+    make_place,
+    make_sevenscenes,
+    make_tum,
+    plane_frame,
+)
 
 from slamdepth.datasets.synth import SynthSettings, render_sequence
 from slamdepth.depth.training import data
@@ -21,6 +30,7 @@ from slamdepth.depth.training.config import TrainConfig
 from slamdepth.depth.training.data import data_folder, known_readers, open_place, register_reader
 from slamdepth.depth.training.lens import raw_pixels, turning_point
 from slamdepth.depth.training.readers.hypersim import planar_depth_m, read_distance_m
+from slamdepth.depth.training.readers.pairs import PairReader
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.pipeline.training_data import sequence_readers
 from slamdepth.types import Camera
@@ -43,6 +53,71 @@ def assert_shows_the_plane(depth_m: np.ndarray, focal_px: float, rtol: float = 0
     known = depth_m > 0
     assert known.mean() > 0.7
     np.testing.assert_allclose(depth_m[known], (DISTANCE_M / (rays @ NORMAL))[known], rtol=rtol)
+
+
+INTRINSICS = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"depth_unit_m": 0}, "depth_unit_m: Input should be greater than 0, got 0"),
+        ({"depth_unit_m": -0.001}, "depth_unit_m: Input should be greater than 0"),
+        ({"depth_unit_m": float("nan")}, "depth_unit_m: Input should be a finite number"),
+        ({"depth_unit_m": float("inf")}, "depth_unit_m: Input should be a finite number"),
+        (
+            {"depth_unit": 0.001},
+            "unknown key 'depth_unit'; known are .*, depth_unit_m, distortion",
+        ),
+        ({"width": float("inf")}, "width: Input should be a finite number"),
+        ({"width": 64.5}, "width: Input should be a valid integer"),
+        ({"height": 0}, "height: Input should be greater than"),
+        ({"fx": -5}, "fx: Input should be greater than 0, got -5"),
+        ({"cx": float("nan")}, "cx: Input should be a finite number"),
+        ({"fy": "wide"}, "fy: Input should be a valid number"),
+        ({"distortion": [0.1, 0, 0, 0]}, r"distortion: needs five finite numbers \[k1, k2, p1, p2, k3\]"),
+        ({"distortion": [0.1] * 6}, "distortion: needs five finite numbers"),
+        ({"distortion": 0.1}, "distortion: needs five finite numbers"),
+        ({"distortion": [0, 0, 0, 0, float("nan")]}, "distortion: needs five finite numbers"),
+    ],
+)
+def test_a_camera_of_pairs_is_whole_or_named(tmp_path: Path, change: dict[str, object], says: str) -> None:
+    folder = make_place(tmp_path / "room")
+    (folder / "camera.json").write_text(json.dumps({**INTRINSICS, **change}))
+    with pytest.raises(DatasetError, match=f"room/camera.json: {says}") as error:
+        open_place(folder)
+    assert "\n" not in str(error.value)
+    for text in ("[]", "3", "{", ""):
+        (folder / "camera.json").write_text(text)
+        with pytest.raises(DatasetError, match=r"room/camera\.json: not readable: "):
+            open_place(folder)
+
+
+def test_pairs_through_a_lens(tmp_path: Path) -> None:
+    folder = make_place(tmp_path / "room")
+    without = open_place(folder)
+    said = {**INTRINSICS, "distortion": [0.3, -0.1, 0.01, 0.02, 0.0]}
+    (folder / "camera.json").write_text(json.dumps(said), encoding="utf-8-sig")
+    place = open_place(folder)
+    assert place.camera.distortion == (0.3, -0.1, 0.01, 0.02, 0.0)
+    assert place.fingerprint != without.fingerprint
+    _, depth = plane_frame(place.camera)
+    cv2.imwrite(str(folder / "00000.png"), np.round(depth * 1000).astype(np.uint16))
+    view = plain_view(place.read(0), 28, 42)
+    assert_shows_the_plane(view.depth_m, view.focal_px, rtol=0.02)
+
+
+def test_a_folder_of_pairs_that_cannot_be_read_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = make_place(tmp_path / "room")
+
+    def refuse(path: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(DatasetError, match="room: cannot be read: Permission denied"):
+        PairReader().open(folder)
 
 
 def test_tum_pairs_by_time_and_undoes_the_lens(tmp_path: Path) -> None:
@@ -206,6 +281,15 @@ def test_a_damaged_image_of_a_sequence_is_named(tmp_path: Path) -> None:
     (folder / "depth" / "1.png").write_bytes(b"x")
     with pytest.raises(DatasetError, match=r"1\.png: the image does not decode"):
         place.read(0)
+
+
+def test_an_image_of_another_size_is_named(tmp_path: Path) -> None:
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    folder = make_tum(tmp_path / "fr", camera, 4)
+    place = open_any(folder)
+    cv2.imwrite(str(folder / "rgb" / "2.png"), np.zeros((24, 32, 3), np.uint8))
+    with pytest.raises(DatasetError, match=r"2\.png: the image is 32x24, the camera says 64x48"):
+        place.read(1)
 
 
 def test_a_reader_is_one_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training pairs: a folder a place, with ``camera.json`` and ``NNNNN.jpg`` + ``NNNNN.png`` files.
 
-``camera.json`` has ``width height fx fy cx cy`` in pixels and, where the depth is not in
-millimetres, ``depth_unit_m``: metres per unit of the 16-bit depth images. ``gravity.txt`` may say where
+``camera.json`` has ``width height fx fy cx cy`` in pixels; where the depth is not in millimetres,
+``depth_unit_m``: metres per unit of the 16-bit depth images; and where the lens distorts both images,
+``distortion``: ``[k1, k2, p1, p2, k3]`` as OpenCV orders them. ``gravity.txt`` may say where
 down is: lines ``NNNNN x y z``, the pair's name and the unit direction of gravity in the camera's frame
 (x right, y down, z forward).
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from slamdepth.depth.training.data import fingerprint, register_reader
 from slamdepth.errors import DatasetError, ImageDecodeError
@@ -28,6 +29,19 @@ GRAVITY_FILE = "gravity.txt"
 _IMAGE_ENDINGS = (".jpg", ".jpeg")
 _UNIT_TOLERANCE = 0.01
 _Direction = tuple[float, float, float]
+
+
+class _CameraFile(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    width: int = Field(ge=1)
+    height: int = Field(ge=1)
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+    depth_unit_m: float = Field(0.001, gt=0)
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -87,22 +101,13 @@ class PairReader:
         return (folder / "camera.json").is_file()
 
     def open(self, folder: Path) -> PairPlace:
-        about = folder / "camera.json"
-        if not about.is_file():
-            raise DatasetError(f"{folder}: no camera.json here, so this is no folder of training pairs")
+        camera, unit = read_camera(folder / "camera.json")
         try:
-            values = json.loads(about.read_text(encoding="utf-8"))
-            camera = Camera(
-                int(values["width"]), int(values["height"]),
-                float(values["fx"]), float(values["fy"]), float(values["cx"]), float(values["cy"]),
-            )  # fmt: skip
-            unit = float(values.get("depth_unit_m", 0.001))
-        except KeyError as error:
-            raise DatasetError(f"{about}: the key {error} is missing") from error
-        except (OSError, ValueError, TypeError) as error:
-            raise DatasetError(f"{about}: not readable: {error}") from error
-        images = sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGE_ENDINGS)
-        pairs = [(path, path.with_suffix(".png")) for path in images if path.with_suffix(".png").is_file()]
+            images = sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGE_ENDINGS)
+            both = [(path, path.with_suffix(".png")) for path in images]
+            pairs = [(image, depth) for image, depth in both if depth.is_file()]
+        except OSError as error:
+            raise DatasetError(f"{folder}: cannot be read: {error.strerror or error}") from error
         if not pairs:
             raise DatasetError(f"{folder}: no pair of NNNNN.jpg and NNNNN.png here")
         alone = len(images) - len(pairs)
@@ -112,6 +117,41 @@ class PairReader:
             folder.name, camera, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), unit, notes,
             downs=tuple(told.get(image.stem) for image, _ in pairs) if told else (),
         )  # fmt: skip
+
+
+def read_camera(path: Path) -> tuple[Camera, float]:
+    """The camera of a ``camera.json``, and metres per unit of the depth images.
+
+    Raises:
+        DatasetError: the file is missing or not readable, or a key is missing, unknown or out of
+            range; names it.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise DatasetError(
+            f"{path.parent}: no camera.json here, so this is no folder of training pairs"
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: not readable: {error}") from error
+    try:
+        said = _CameraFile.model_validate_json(text)
+    except ValidationError as error:
+        raise DatasetError(f"{path}: {_trouble(error)}") from error
+    intrinsics = said.width, said.height, said.fx, said.fy, said.cx, said.cy
+    return Camera(*intrinsics, distortion=said.distortion), said.depth_unit_m
+
+
+def _trouble(error: ValidationError) -> str:
+    first = error.errors()[0]
+    name = ".".join(str(part) for part in first["loc"])
+    if name.startswith("distortion"):
+        return "distortion: needs five finite numbers [k1, k2, p1, p2, k3]"
+    if first["type"] == "missing":
+        return f"the key '{name}' is missing"
+    if first["type"] == "extra_forbidden":
+        return f"unknown key '{name}'; known are {', '.join(_CameraFile.model_fields)}"
+    return f"{name}: {first['msg']}, got {first['input']!r:.40}" if name else f"not readable: {first['msg']}"
 
 
 def read_gravity(path: Path) -> dict[str, _Direction]:
