@@ -18,6 +18,8 @@ from sequences import image_rgb, make_sevenscenes, make_tum, write_image
 from slamdepth.errors import ConfigError, DatasetError, OutputError
 from slamdepth.evaluation.depth_statistics import DepthStatistics
 from slamdepth.pipeline.data_stats import StatisticsInterrupted, data_statistics
+from slamdepth.pipeline.depth_data import open_depth_data, thinned
+from slamdepth.report.data_stats import overview_rows
 
 
 def place(folder: Path, millimetres: list[int], *, unit: float = 0.001) -> Path:
@@ -86,7 +88,7 @@ def test_stride_limit_and_pairs_without_depth(tmp_path: Path) -> None:
     about = data_statistics([folder], stride=2, max_frames=3)
     (one,) = about["sets"]
     assert (one["pairs"], one["images"]) == (9, 3)
-    assert (one["min_m"], one["max_m"]) == pytest.approx((0.1, 0.5))
+    assert (one["min_m"], one["max_m"]) == pytest.approx((0.1, 0.9))
     tum = make_tum(tmp_path / "tum")
     (tum / "depth" / "2.png").unlink()
     (one,) = data_statistics([tum])["sets"]
@@ -134,6 +136,46 @@ def test_the_command_prints_both_tables(tmp_path: Path, monkeypatch: pytest.Monk
     missing = call("data-stats", tmp_path / "nowhere")
     assert missing.returncode == 2
     assert "no such folder" in missing.stderr
+
+
+def test_frames_are_spread_evenly_and_said_to_be_some(tmp_path: Path) -> None:
+    folder = place(tmp_path / "p", list(range(100, 1200, 100)))
+    (found,) = open_depth_data(folder)
+    assert thinned(found, None, 4) == [0, 3, 7, 10]
+    assert thinned(found, None, 1) == [0]
+    assert thinned(found, 5, 2) == [0, 10]
+    assert thinned(found, None, 11) == thinned(found) == list(range(11))
+    about = data_statistics([folder], max_frames=4, output=tmp_path / "out")
+    assert (about["sets"][0]["pairs"], about["sets"][0]["images"]) == (11, 4)
+    assert overview_rows(about)[1][0][1] == "4 of 11"
+    assert overview_rows(data_statistics([folder]))[1][0][1] == "11"
+    assert "at most 4 of each, spread evenly over it" in (tmp_path / "out" / "data-stats.html").read_text()
+
+
+def test_tables_keep_names_whole_in_80_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    names = ["shelf_bin_realsense", "rgbd_dataset_freiburg1_desk_vali"]
+    folders = [place(tmp_path / name, list(range(500, 520))) for name in names]
+    done = call("data-stats", *folders[:1], "--max-frames", 3)
+    lines = done.stdout.splitlines()
+    (row,) = [line for line in lines if "16x12" in line]
+    assert row.split() == [
+        "shelf_bin_realsense",
+        "3",
+        "of",
+        "20",
+        "16x12",
+        "8",
+        "90°",
+        "50.0",
+        "%",
+        "50–50",
+        "%",
+    ]
+    done = call("data-stats", *folders)
+    assert max(map(len, done.stdout.splitlines())) <= 80
+    for name in names:
+        assert done.stdout.count(name) == 2, done.stdout
 
 
 @pytest.mark.data

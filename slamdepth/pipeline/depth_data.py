@@ -7,6 +7,8 @@ import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import numpy as np
+
 from slamdepth.datasets import open_dataset
 from slamdepth.depth.training.data import Place, data_folder, known_readers, open_place
 from slamdepth.errors import DatasetError
@@ -68,12 +70,16 @@ def thinned(place: Place, stride: int | None = None, max_frames: int | None = No
     Args:
         stride: every so-manieth image, of a sequence counted with those that lack depth;
             None: 10 of a sequence, 1 of others, which are thinned already.
-        max_frames: no more than so many, the first ones.
+        max_frames: no more than so many, spread evenly over those.
     """
     numbers: Iterable[int] = range(len(place))
     if isinstance(place, SequencePlace):
         stride, numbers = stride or _SEQUENCE_STRIDE, place.frames
-    return [index for index, number in enumerate(numbers) if number % (stride or 1) == 0][:max_frames]
+    chosen = [index for index, number in enumerate(numbers) if number % (stride or 1) == 0]
+    if max_frames is None or len(chosen) <= max_frames:
+        return chosen
+    spread = np.linspace(0, len(chosen) - 1, max_frames).round().astype(int)
+    return [chosen[position] for position in spread.tolist()]
 
 
 def readable(place: Place, indices: Iterable[int]) -> Iterator[Frame]:

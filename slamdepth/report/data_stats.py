@@ -21,11 +21,14 @@ from slamdepth.report.text import MISSING, count, fixed, percent
 from slamdepth.types import Camera
 
 if TYPE_CHECKING:
+    from rich.console import JustifyMethod
     from rich.table import Table
 
 PICTURE, PAGE = "histograms.png", "data-stats.html"
 _INK, _MUTED, _RULE, _BAR = "#14181f", "#5b6575", "#dfe3e9", "#9aa5b4"
 _BINS = 80
+_LONGEST_NAME = 32
+"""Longer names are broken in a terminal's table, so that its numbers need not be."""
 _DEPTHS = (
     ("min", "min_m"), ("1 %", "p1_m"), ("5 %", "p5_m"), ("median", "p50_m"),
     ("95 %", "p95_m"), ("99 %", "p99_m"), ("max", "max_m"),
@@ -47,22 +50,26 @@ class DataRow:
     notes: tuple[str, ...] = ()
 
 
+def looked_at(images: int, size: int) -> str:
+    """How many pairs a data set has, and of how many the figures are where those are not all."""
+    return count(size) if images == size else f"{count(images)} of {count(size)}"
+
+
 def overview_rows(about: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Heads and rows: number, size, lens and sparsity of each data set of ``data-stats.json``."""
-    heads = ["data set", "pairs", "looked at", "pixels", "focal (px)", "view (°)", "no depth", "per image"]
+    heads = ["data set", "pairs", "pixels", "f (px)", "view", "no depth", "per image"]
     rows = []
     for one in about["sets"]:
         spread = one["without_depth_per_image"]
         rows.append(
             [
                 one["name"],
-                count(one["pairs"]),
-                count(one["images"]),
+                looked_at(one["images"], one["pairs"]),
                 f"{one['width']}x{one['height']}",
                 fixed(one["fx"], 0),
-                fixed(one["view_deg"], 0),
+                fixed(one["view_deg"], 0) + "°",
                 percent(one["without_depth"]),
-                MISSING if spread is None else f"{100 * spread['min']:.0f} to {100 * spread['max']:.0f} %",
+                MISSING if spread is None else f"{100 * spread['min']:.0f}–{100 * spread['max']:.0f} %",
             ]
         )
     return heads, rows
@@ -83,8 +90,10 @@ def data_tables(about: dict[str, Any]) -> list[Table]:
     tables = []
     for heads, rows in (overview_rows(about), range_rows(about)):
         shown = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
+        names_stay = max(len(row[0]) for row in rows) <= _LONGEST_NAME
         for number, head in enumerate(heads):
-            shown.add_column(head, justify="right" if number else "left", overflow="fold")
+            justify: JustifyMethod = "right" if number else "left"
+            shown.add_column(head, justify=justify, overflow="fold", no_wrap=not number and names_stay)
         for row in rows:
             shown.add_row(*map(Text, row))
         tables.append(shown)
@@ -153,7 +162,8 @@ def _histogram(panel: Any, row: DataRow, edges_m: Any, colours: Any) -> None:
     panel.spines["left"].set_visible(False)
     panel.grid(axis="x", color=_RULE, lw=0.6)
     camera = row.camera
-    facts = f"{count(row.size)} pairs, {camera.width}x{camera.height}, f {camera.fx:.0f} px"
+    pairs = looked_at(row.statistics.images, row.size)
+    facts = f"{pairs} pairs, {camera.width}x{camera.height}, f {camera.fx:.0f} px"
     panel.set_title(row.name, loc="left", fontsize=9.5, fontweight="bold", pad=2)
     panel.set_title(facts, loc="right", fontsize=8.5, color=_MUTED, pad=2)
 
@@ -192,8 +202,11 @@ def _page(png: bytes, about: dict[str, Any]) -> str:
     listed = "".join(f"<li>{escape(note)}</li>" for note in notes)
     looked = "every image" if about["stride"] == 1 else f"every {about['stride']}th image"
     if about["max_frames"] is not None:
-        looked += f", at most {about['max_frames']} of each"
-    sparsity = "No depth: share of all pixels; per image: from the densest to the sparsest."
+        looked += f", at most {about['max_frames']} of each, spread evenly over it"
+    sparsity = (
+        "Pairs: how many the figures are of, of how many there are. f: focal length; view: across. "
+        "No depth: share of all pixels; per image: from the densest to the sparsest."
+    )
     body = section("Depths", "Known depth along the optical axis, over one axis for all.", picture)
     body += section("How much, how sparse, which lens", sparsity, table(*overview_rows(about)))
     body += section("Ranges", "Percentiles of the known pixels.", table(*range_rows(about)))
