@@ -188,6 +188,56 @@ def test_onnx_input_and_output() -> None:
         model.predict(frame_of())
 
 
+def test_onnx_that_does_not_run_is_one_line() -> None:
+    about = onnx_model.OnnxAbout(kind=DepthKind.METRIC)
+    session = StandIn()
+
+    def run(names: list[str], feed: dict[str, Any]) -> list[Any]:
+        raise RuntimeError("INVALID_ARGUMENT : Got invalid dimensions\nindex: 0 Got: 1 Expected: 2")
+
+    session.run = run  # type: ignore[method-assign]
+    card = ModelCard("onnx:x", about.kind, (28, 28), None, "", "")
+    model = onnx_model.OnnxDepth(session, about, card, ())
+    says = r"onnx:x: does not run on an image \(1, 3, 28, 28\): INVALID_ARGUMENT : Got invalid dimensions$"
+    with pytest.raises(WeightsError, match=says):
+        model.predict(frame_of())
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"input_size": [-112, 112]}, "input_size.0: Input should be greater than or equal to 1"),
+        ({"input_size": [0, 112]}, "input_size.0: "),
+        ({"input_size": [112]}, "input_size.1: "),
+        ({"input_size": [112, 10**9]}, "input_size.1: "),
+        ({"multiple": 0}, "multiple: "),
+        ({"std": [0, 0, 0]}, "std.0: Input should be greater than 0"),
+        ({"std": [1, 1, -1]}, "std.2: "),
+        ({"mean": [float("nan"), 0, 0]}, "mean.0: Input should be a finite number"),
+        ({"focal_px": float("inf")}, "focal_px: "),
+    ],
+)
+def test_what_onnx_says_of_itself_is_checked(tmp_path: Path, change: dict[str, Any], says: str) -> None:
+    with pytest.raises(WeightsError, match=rf"net\.onnx, metadata 'slamdepth': {says}") as error:
+        onnx_model._about(tmp_path / "net.onnx", {"slamdepth": json.dumps({**METRIC, **change})})
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "shape", [[2, 3, 28, 28], [0, 3, 28, 28], [1, 4, 28, 28], [1, 3, 28], [3], [2, 3, "h", "w"]]
+)
+def test_onnx_takes_one_image(shape: list[Any]) -> None:
+    session, about = StandIn(), onnx_model.OnnxAbout(kind=DepthKind.METRIC, input_size=(28, 28))
+    one = SimpleNamespace(name="image", shape=shape, type="tensor(float)")
+    session.get_inputs = lambda: [one]  # type: ignore[method-assign]
+    with pytest.raises(WeightsError, match="not one image"):
+        onnx_model._input_size(Path("net.onnx"), session, about)
+    one.shape = ["batch", 3, 28, 28]
+    assert onnx_model._input_size(Path("net.onnx"), session, about) == ((28, 28), True)
+    one.shape = [None, None, None, "w"]
+    assert onnx_model._input_size(Path("net.onnx"), session, about) == ((28, 28), False)
+
+
 def test_onnx_of_a_fixed_size(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed (extra 'onnx')")
     path = tmp_path / "net.onnx"

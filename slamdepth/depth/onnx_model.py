@@ -21,7 +21,7 @@ import importlib
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,19 +38,21 @@ METADATA_KEY = "slamdepth"
 _KINDS = ", ".join(f'"{kind.value}"' for kind in DepthKind)
 
 Three = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+Side = Annotated[int, Field(ge=1, le=1 << 14)]
 
 
 class OnnxAbout(BaseModel):
     """What the author of an ONNX file says of it; see the module."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     kind: DepthKind
-    input_size: tuple[int, int] | None = None
-    multiple: int = Field(14, ge=1)
-    focal_px: float | None = Field(None, gt=0, allow_inf_nan=False)
+    input_size: tuple[Side, Side] | None = None
+    multiple: Side = 14
+    focal_px: float | None = Field(None, gt=0)
     mean: Three = (0.485, 0.456, 0.406)
-    std: Three = (0.229, 0.224, 0.225)
+    std: tuple[Positive, Positive, Positive] = (0.229, 0.224, 0.225)
     licence: str = "unknown"
     trained_on: str = "unknown"
 
@@ -102,6 +104,11 @@ class OnnxDepth(NetworkDepth):
         return cls(session, about, card, (info,), device, is_fixed=is_fixed)
 
     def infer(self, image_rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], tuple[int, int]]:
+        """See :meth:`NetworkDepth.infer`.
+
+        Raises:
+            WeightsError: the graph does not run on the image, or its output is not one map.
+        """
         import cv2
 
         height, width = image_rgb.shape[:2]
@@ -115,7 +122,13 @@ class OnnxDepth(NetworkDepth):
         std: NDArray[np.float32] = np.array(self._about.std, dtype=np.float32)
         image = (image - mean) / std
         image = np.ascontiguousarray(image.transpose(2, 0, 1)[None])
-        out = np.asarray(self._session.run([self._output], {self._input: image})[0], dtype=np.float32)
+        try:
+            found = self._session.run([self._output], {self._input: image})
+        except Exception as error:  # ONNX Runtime's errors share no base class of their own
+            raise WeightsError(
+                f"{self.name}: does not run on an image {image.shape}: {_first_line(error)}"
+            ) from error
+        out = np.asarray(found[0], dtype=np.float32)
         if out.ndim < 2 or out.size != out.shape[-2] * out.shape[-1]:
             raise WeightsError(
                 f"{self.name}: the first output is {out.shape}, not one map (1, 1, rows, columns)"
@@ -142,8 +155,11 @@ def _open(path: Path, device: str) -> Any:
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=[provider])
     except Exception as error:  # ONNX Runtime's errors share no base class of their own
-        first_line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise WeightsError(f"{path}: not a readable ONNX file: {first_line}") from error
+        raise WeightsError(f"{path}: not a readable ONNX file: {_first_line(error)}") from error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _about(path: Path, metadata: dict[str, str]) -> OnnxAbout:
@@ -169,7 +185,8 @@ def _input_size(path: Path, session: Any, about: OnnxAbout) -> tuple[tuple[int, 
     """Rows and columns of the input, and whether the graph fixes them."""
     inputs = session.get_inputs()
     shape = list(inputs[0].shape) if inputs else []
-    if len(inputs) != 1 or len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != 3):
+    fixed = [size for size in zip(shape[:2], (1, 3), strict=False) if isinstance(size[0], int)]
+    if len(inputs) != 1 or len(shape) != 4 or any(found != needed for found, needed in fixed):
         raise WeightsError(
             f"{path}: takes {[(i.name, i.shape) for i in inputs]}, not one image (1, 3, rows, columns)"
         )
