@@ -17,7 +17,7 @@ from slamdepth.depth.down import DownEstimate
 from slamdepth.depth.head import HeadEnsemble, HeadShape, load_head
 from slamdepth.depth.model import Dinov2Depth
 from slamdepth.depth.training import down as training_down
-from slamdepth.depth.training import loop
+from slamdepth.depth.training import loop, plan, timing
 from slamdepth.depth.training.caches import of_gravity, of_member, plan_caches
 from slamdepth.depth.training.config import TrainConfig
 from slamdepth.depth.training.down import learn_down, offered_directions
@@ -124,6 +124,20 @@ def test_gravity_has_to_be_found_out(settings: dict[str, Any]) -> None:
     settings["view"]["upright"] = False
     with pytest.raises(ConfigError, match=r"setting 'head'.*upright"):
         TrainConfig.from_dict(settings)
+
+
+def test_a_plan_counts_the_time_it_takes(settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plan, "second_time", lambda work: 0.01)
+    monkeypatch.setattr(timing, "second_time", lambda work: (work(), 0.25)[1])
+    config = TrainConfig.from_dict(settings)
+    head = config.head.model_copy(update={"down_dim": 0})
+    with_it, without = (
+        plan.plan_training(one, backbone=tiny_backbone()).training_s
+        for one in (config, config.model_copy(update={"head": head}))
+    )
+    assert with_it is not None
+    assert without is not None
+    assert with_it - without == pytest.approx(3 * 0.25)
 
 
 def test_a_trained_head_knows_which_way_is_down(settings: dict[str, Any], tmp_path: Path) -> None:

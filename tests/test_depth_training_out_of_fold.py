@@ -14,7 +14,7 @@ from training_places import make_place
 
 from slamdepth.depth.doubt import FEATURES, Doubt, features, together
 from slamdepth.depth.head import load_head
-from slamdepth.depth.training import loop, out_of_fold
+from slamdepth.depth.training import loop, out_of_fold, timing
 from slamdepth.depth.training.caches import Encoder, plan_caches
 from slamdepth.depth.training.config import AugmentConfig, TrainConfig
 from slamdepth.depth.training.out_of_fold import (
@@ -161,6 +161,26 @@ def test_a_head_with_a_doubt_is_made_judged_and_planned(settings: dict[str, Any]
     depth, sigma = (a - b for a, b in zip(outputs(head), outputs(without), strict=True))
     assert float(depth.abs().max()) == 0  # depth is the members'
     assert float(sigma.abs().max()) > 0
+
+
+def test_a_plan_counts_the_time_of_every_fit(
+    settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned = plan_caches(TrainConfig.from_dict(settings), "test")
+    steps: list[int | None] = []
+    real = out_of_fold.fit_doubt
+
+    def fit(errors: Errors, seed: int, **more: Any) -> Doubt:
+        steps.append(more.get("steps"))
+        return real(errors, seed, **more)
+
+    monkeypatch.setattr(timing, "fit_doubt", fit)
+    seconds = iter((0.5, 2.0))
+    monkeypatch.setattr(timing, "second_time", lambda work: (work(), next(seconds))[1])
+    views = 4 + 4  # of hall and of loft, each left out once; what is mixed is not tried on
+    before_s = 0.5 * views * out_of_fold.PIXELS / timing._MADE_UP_PIXELS
+    assert timing.doubt_s(planned, plan_folds(planned), 24) == pytest.approx(3 * (before_s + 1.5))
+    assert steps == [0, None]
 
 
 def outputs(head: Any) -> tuple[torch.Tensor, torch.Tensor]:

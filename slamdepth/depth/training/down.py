@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 STEPS = 2000
-_BATCH = 16
+BATCH = 16
 _RATE = 2e-3
 _DECAY = 0.1
 _DROPOUT = 0.4
@@ -56,16 +56,16 @@ def learn_down(
     """
     known = [np.flatnonzero(np.linalg.norm(cache.down, axis=1) > 0.5) for cache in caches]
     pool = np.array([(c, k) for c, views in enumerate(known) for k in views])
-    if len(pool) < _BATCH:
+    if len(pool) < BATCH:
         raise ConfigError("setting 'head.down_dim': gravity is known of too few views to learn it from")
     rng = np.random.default_rng([seed, 23])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        scorer = DownScorer(len(shape.taps) * shape.token_dim, shape.down_dim, _DROPOUT).to(device).train()
+        scorer = new_scorer(shape, device)
         optimiser = torch.optim.AdamW(scorer.parameters(), lr=_RATE, weight_decay=_DECAY)
         for step in range(STEPS):
-            chosen = pool[np.sort(rng.choice(len(pool), _BATCH, replace=False))]
-            loss = _loss(scorer, caches, chosen, rng, device)
+            chosen = pool[np.sort(rng.choice(len(pool), BATCH, replace=False))]
+            loss = loss_of(scorer, caches, chosen, rng, device)
             for group in optimiser.param_groups:
                 group["lr"] = _RATE * (1 - step / STEPS) + 1e-5
             optimiser.zero_grad()
@@ -77,14 +77,20 @@ def learn_down(
     return scorer.eval()
 
 
-def _loss(
+def new_scorer(shape: HeadShape, device: str) -> DownScorer:
+    """One that has learnt nothing."""
+    return DownScorer(len(shape.taps) * shape.token_dim, shape.down_dim, _DROPOUT).to(device).train()
+
+
+def loss_of(
     scorer: DownScorer,
     caches: Sequence[FeatureCache],
     chosen: NDArray[np.int64],
     rng: np.random.Generator,
     device: str,
 ) -> torch.Tensor:
-    """Cross entropy of the scores and of how near to gravity each direction is."""
+    """Cross entropy of the scores and of how near to gravity each direction is, in the samples
+    ``chosen (B, 2)``, each a cache and a sample of it."""
     tokens, fields, angles = [], [], []
     for c, k in chosen:
         cache = caches[c]

@@ -32,7 +32,8 @@ logger = logging.getLogger(__name__)
 
 COMPONENTS = 16
 _FOLDS = 3
-_PIXELS = 96
+PIXELS = 96
+"""Of a view, that a doubt learns from."""
 _FEWEST = 20
 _VIEWS_AT_ONCE = 10
 _STEPS, _BATCH, _RATE, _DECAY = 300, 2048, 3e-3, 0.3
@@ -110,7 +111,7 @@ def errors_of(
     seed: Sequence[int],
     device: str,
 ) -> Errors | None:
-    """Up to ``_PIXELS`` random pixels of each of ``views (n,)`` of ``cache`` at 1/7 of the resolution; None
+    """Up to ``PIXELS`` random pixels of each of ``views (n,)`` of ``cache`` at 1/7 of the resolution; None
     where no view has enough depth.
 
     Args:
@@ -131,7 +132,7 @@ def errors_of(
                 continue
             error = log_depth[k][target[k] > 0] - target[k][target[k] > 0].log()
             error = (error - error.median()).abs()
-            some = torch.from_numpy(rng.choice(len(known), min(_PIXELS, len(known)), replace=False))
+            some = torch.from_numpy(rng.choice(len(known), min(PIXELS, len(known)), replace=False))
             row, column = known[some].unbind(dim=1)
             parts.append((
                 last[k][:, row // 2, column // 2].T.half(), read[k][row, column], error[some],
@@ -152,13 +153,17 @@ def join(parts: Sequence[Errors]) -> Errors:
     return Errors(*(torch.cat([getattr(part, name) for part in moved]) for name in _FIELDS))
 
 
-def fit_doubt(errors: Errors, seed: int, told: Callable[[int], None] = lambda _: None) -> Doubt:
+def fit_doubt(
+    errors: Errors, seed: int, told: Callable[[int], None] = lambda _: None, *, steps: int | None = None
+) -> Doubt:
     """Learn log spread by Laplace likelihood (Kendall and Gal 2017) of the errors' shares in a
     view's mean error, times the mean of all. Each place counts the same.
 
     Args:
-        told: called with the number of steps done, of ``_STEPS``.
+        told: called with the number of steps done.
+        steps: how many; None: ``_STEPS``.
     """
+    steps = _STEPS if steps is None else steps
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         doubt = Doubt(errors.tokens.shape[1], min(COMPONENTS, errors.tokens.shape[1]))
@@ -173,9 +178,9 @@ def fit_doubt(errors: Errors, seed: int, told: Callable[[int], None] = lambda _:
         target = errors.share * errors.error.mean()
         places = [torch.nonzero(errors.place == place)[:, 0] for place in errors.place.unique()]
         optimiser = torch.optim.AdamW(doubt.parameters(), lr=_RATE, weight_decay=_DECAY)
-        for step in range(_STEPS):
+        for step in range(steps):
             for group in optimiser.param_groups:
-                group["lr"] = _RATE * (1 - step / _STEPS)
+                group["lr"] = _RATE * (1 - step / steps)
             some = torch.cat([of[torch.randint(len(of), (_BATCH // len(places),))] for of in places])
             spread = doubt.judge(read[some])
             loss = (target[some] * (-spread).exp() + spread).mean()

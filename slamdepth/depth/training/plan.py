@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from slamdepth.depth.training.out_of_fold import plan_folds
 from slamdepth.depth.training.output import check_output
 from slamdepth.depth.training.stages import predict
 from slamdepth.depth.training.store import bytes_per_sample, done_on_disk
+from slamdepth.depth.training.timing import doubt_s, down_s, second_time
 from slamdepth.errors import WeightsError
 
 
@@ -54,8 +54,10 @@ class TrainingPlan:
     """What a training would take.
 
     Attributes:
-        features_s, training_s: wall time, from a view and a step of each stage measured just
-            now; None where the backbone is missing.
+        steps: of the heads.
+        features_s, training_s: wall time, from a view and a step of each stage measured just now, with
+            what finds out which way is down and what learns uncertainty; None where the backbone is
+            missing.
         missing: why it could not be measured.
         benchmarks: benchmarks the head will have seen, each with the places of it.
     """
@@ -122,13 +124,15 @@ def plan_training(
         coarse_s, fine_s = _step_s(config, dim, patch, device)
         epoch_s = config.coarse_epochs * coarse_s + config.fine_epochs * fine_s
         training_s = steps * epoch_s + fold_steps * coarse_s
+        training_s += down_s(config, dim, patch, device) if config.head.down_dim else 0.0
+        training_s += doubt_s(planned, folds, dim) if folds else 0.0
     total = steps * (config.coarse_epochs + config.fine_epochs) + fold_steps
     return TrainingPlan(sources, total, features_s, training_s, missing, benchmarks_seen(planned))
 
 
 def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:
     images = [np.zeros((config.view.rows, config.view.columns, 3), np.uint8)] * 4
-    return _second_time(lambda: encode(images, backbone, config.head.taps, device)) / len(images)
+    return second_time(lambda: encode(images, backbone, config.head.taps, device)) / len(images)
 
 
 def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[float, float]:
@@ -148,12 +152,4 @@ def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[flo
         loss.backward()
         float(loss.detach())  # waits for a GPU
 
-    return _second_time(lambda: step(False)), _second_time(lambda: step(True))
-
-
-def _second_time(work: Callable[[], object]) -> float:
-    """Seconds of the second call: the first one pays for memory and plans."""
-    work()
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
+    return second_time(lambda: step(False)), second_time(lambda: step(True))
