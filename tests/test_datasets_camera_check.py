@@ -67,8 +67,11 @@ def test_the_radius_of_the_fold_is_the_largest_the_lens_reaches() -> None:
 def test_no_pixel_of_what_passes_is_seen_twice(k1: float, k2: float, k3: float) -> None:
     camera = with_distortion(k1, k2, 0.0, 0.0, k3)
     try:
-        check_plausible(camera)
+        notes = check_plausible(camera)
     except CameraError:
+        return
+    if notes:
+        assert "turns back 9" in notes[0]  # in the outermost tenth, where it is no error
         return
     r = np.linspace(0.0, 10.0, 20_001)
     reached = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
@@ -84,7 +87,7 @@ def test_any_numbers_are_plausible_or_refused(distortion: tuple[float, ...]) -> 
         notes = check_plausible(with_distortion(*distortion))
     except CameraError:
         return
-    assert notes == []
+    assert all("turns back 9" in note for note in notes)
 
 
 def test_a_very_wide_view_is_noted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -30,8 +30,7 @@ def eval_depth_command(
         list[Path],
         typer.Argument(
             metavar="DATA",
-            help="Sequences with sensor depth, training pairs or Hypersim scenes; of the latter two also a "
-            "folder that holds several.",
+            help="Sequences with sensor depth, training pairs or Hypersim scenes, or a folder of several.",
         ),
     ],
     depth_weights: DepthWeightsOption = None,

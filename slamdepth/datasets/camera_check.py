@@ -23,6 +23,9 @@ WIDE_VIEW_DEG = 120.0
 _UNDONE_SHARE = 0.05
 """Of the longer side: real lenses come back to 0.2 % of it, those whose inverse diverges to 10 % and more."""
 
+_LEAST_REACH = 0.9
+"""Of the way to the farthest corner: fits of real lenses may turn back where the board never was."""
+
 _STRONGEST, _NEGLIGIBLE = 1e4, 1e-12
 """Bounds within which a coefficient can be reckoned with."""
 
@@ -35,14 +38,14 @@ def check_plausible(camera: Camera) -> list[str]:
             undone; without the name of the file.
     """
     _check_principal_point(camera)
-    _check_distortion(camera)
+    notes = _check_distortion(camera)
     view_deg = horizontal_view_deg(camera)
-    if view_deg <= WIDE_VIEW_DEG:
-        return []
-    return [
-        f"fx {camera.fx:g} is a horizontal view of {view_deg:.0f} degrees in an image {camera.width} pixels "
-        "wide: if the camera sees less, fx, fy, cx and cy are of images of another size"
-    ]
+    if view_deg > WIDE_VIEW_DEG:
+        notes.append(
+            f"fx {camera.fx:g} is a horizontal view of {view_deg:.0f} degrees in an image {camera.width} "
+            "pixels wide: if the camera sees less, fx, fy, cx and cy are of images of another size"
+        )
+    return notes
 
 
 def horizontal_view_deg(camera: Camera) -> float:
@@ -77,9 +80,10 @@ def _check_principal_point(camera: Camera) -> None:
             )
 
 
-def _check_distortion(camera: Camera) -> None:
+def _check_distortion(camera: Camera) -> list[str]:
+    """What is unusual in it, a line each."""
     if not camera.is_distorted:
-        return
+        return []
     if max(map(abs, camera.distortion)) > _STRONGEST:
         raise CameraError(f"{_named(camera)} is too strong for any lens: check the order of its numbers")
     u = np.linspace(-0.5, camera.width - 0.5, 17)
@@ -87,12 +91,16 @@ def _check_distortion(camera: Camera) -> None:
     grid_px = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     offsets = (grid_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     reach = fold_radius(camera) / float(np.hypot(*offsets.T).max())
+    notes = []
     if reach < 1.0:
-        raise CameraError(
+        folds = (
             f"{_named(camera)} turns back {math.floor(100 * reach)} % of the way from the principal point to "
-            "the farthest corner, so what lies beyond is seen twice or never: check the order of its "
-            "numbers, or calibrate with the board in the corners and fewer coefficients"
+            "the farthest corner, so what lies beyond is seen twice or never"
         )
+        advice = "calibrate with the board in the corners and fewer coefficients"
+        if reach < _LEAST_REACH:
+            raise CameraError(f"{folds}: check the order of its numbers, or {advice}")
+        notes.append(f"{folds}: better {advice}")
     with np.errstate(all="ignore"):
         lost_px = float(np.abs(_distorted(camera, camera.undistort_points(grid_px)) - grid_px).max())
     if not lost_px <= _UNDONE_SHARE * max(camera.width, camera.height):
@@ -100,6 +108,7 @@ def _check_distortion(camera: Camera) -> None:
             f"{_named(camera)} cannot be undone, so strong is it (a pixel comes back {lost_px:.1f} pixels "
             "from where it was): check the order of its numbers"
         )
+    return notes
 
 
 def _named(camera: Camera) -> str:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from slamdepth.datasets import open_dataset
 from slamdepth.depth.training.data import Place, data_folder, known_readers, open_place
 from slamdepth.errors import DatasetError
-from slamdepth.pipeline.training_data import SequencePlace
+from slamdepth.pipeline.training_data import SequencePlace, sequence_readers
 from slamdepth.types import Frame
 
 logger = logging.getLogger(__name__)
@@ -21,8 +21,8 @@ _SEQUENCE_STRIDE = 10
 
 
 def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
-    """What a folder holds: training pairs (``camera.json``) or a Hypersim scene, several of
-    those, each in a folder of its own, or a sequence of a known layout.
+    """What a folder holds: training pairs (``camera.json``), a Hypersim scene or a sequence of a known
+    layout, or several of those, each in a folder of its own.
 
     Args:
         path: absolute, relative to the current folder, or below ``$SLAMDEPTH_DATA``.
@@ -37,31 +37,47 @@ def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
         if path.is_file():
             raise DatasetError(f"{path}: is a file; name a folder of images with depth")
         folder = data_folder(str(path))
-        is_one = _is_place(folder)
+        is_one, is_sequence = _is_place(folder), _is_sequence(folder)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
-    places = [folder] if is_one else _places_inside(folder)
+    places = [folder] if is_one else [] if is_sequence else _inside(folder, _is_place)
     if places and camera is not None:
         raise DatasetError(f"{places[0]}: its camera is known with it; leave out --camera")
     if places:
         return [open_place(place) for place in places]
-    return [SequencePlace.of(open_dataset(folder, camera))]
+    sequences = [folder] if is_sequence else _inside(folder, _is_sequence)
+    if not sequences:
+        layouts = {**known_readers(), **sequence_readers()}
+        known = "; ".join(f"{name} ({reader.needs})" for name, reader in layouts.items() if name != "video")
+        raise DatasetError(
+            f"{path}: no known sequence layout and no other images with depth; known are: {known}"
+        )
+    datasets = [open_dataset(sequence, camera) for sequence in sequences]
+    with_depth = [dataset for dataset in datasets if dataset.has_depth]
+    for dataset in datasets if with_depth else ():
+        if not dataset.has_depth:
+            logger.warning("%s: left out, has no sensor depth", dataset.path)
+    return [SequencePlace.of(dataset) for dataset in with_depth or datasets]
 
 
 def _is_place(folder: Path) -> bool:
     return any(reader.matches(folder) for reader in known_readers().values())
 
 
-def _places_inside(folder: Path) -> list[Path]:
-    """The folders in it that are a place; one that cannot be looked into is left out with a warning."""
-    places = []
+def _is_sequence(folder: Path) -> bool:
+    return any(reader.matches(folder) for reader in sequence_readers().values())
+
+
+def _inside(folder: Path, is_wanted: Callable[[Path], bool]) -> list[Path]:
+    """The folders in it that are wanted; one that cannot be looked into is left out with a warning."""
+    found = []
     for below in sorted(folder.glob("*")):
         try:
-            if below.is_dir() and _is_place(below):
-                places.append(below)
+            if below.is_dir() and is_wanted(below):
+                found.append(below)
         except OSError as error:
             logger.warning("%s: left out, cannot be read: %s", below, error.strerror or error)
-    return places
+    return found
 
 
 def thinned(place: Place, stride: int | None = None, max_frames: int | None = None) -> list[int]:
