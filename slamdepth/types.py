@@ -175,7 +175,7 @@ class DepthPrediction:
     """A dense map from a depth model, at the resolution of the frame it was made for.
 
     Attributes:
-        values: ``(H, W)`` float32; metres for METRIC, unitless otherwise; 0 = unknown.
+        values: ``(H, W)`` float32; metres for METRIC, 0 = unknown; unitless otherwise, 0 a value like others.
         kind: what ``values`` means. Only ``slamdepth.depth.alignment`` turns a
             prediction into metres of the map.
         sigma_log: ``(H, W)`` float32 standard deviation of the natural logarithm of the

@@ -25,7 +25,7 @@ from slamdepth.depth.head import (
 )
 from slamdepth.depth.head_layers import convex_upsample
 from slamdepth.depth.layout import check_layout, dinov2_layout, pack_about
-from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, INPUT_PX, focal_factor, input_size
+from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, INPUT_PX, focal_px_at, input_size
 from slamdepth.errors import WeightsError
 from slamdepth.types import Camera
 
@@ -303,7 +303,7 @@ def test_usual_sizes() -> None:
     assert input_size(480, 640, 238 * 322) == (238, 322)
 
 
-def test_focal_factor_follows_the_resized_camera() -> None:
+def test_the_focal_length_follows_the_resized_camera() -> None:
     camera = Camera(644, 476, 2 * CANONICAL_FOCAL_PX, 2 * CANONICAL_FOCAL_PX, 321.5, 237.5)
-    assert focal_factor(camera, 238, 322) == pytest.approx(1.0)
-    assert focal_factor(camera, 476, 644) == pytest.approx(2.0)
+    assert focal_px_at(camera, 238, 322) == pytest.approx(CANONICAL_FOCAL_PX)
+    assert focal_px_at(camera, 476, 644) == pytest.approx(2 * CANONICAL_FOCAL_PX)

@@ -39,7 +39,7 @@ class MirroredDepth:
         self._model = model
 
     def predict(self, frame: Frame) -> DepthPrediction:
-        """Depth ``(H, W)`` of ``frame``; unknown where both looks leave it so."""
+        """Depth ``(H, W)`` of ``frame``; metres are unknown where both looks leave them so."""
         one = self._model.predict(frame)
         other = self._model.predict(mirror_image(frame, one.gravity))
         is_metric = self.kind is DepthKind.METRIC
@@ -67,6 +67,7 @@ def mirror_image(frame: Frame, gravity: NDArray[np.float64] | None = None) -> Fr
 
 
 def _mean(one: Floats, other: Floats, *, is_geometric: bool) -> Floats:
-    """Pixel by pixel; where one is 0, unknown, the other counts alone."""
-    mean = np.sqrt(one * other) if is_geometric else (one + other) / 2
-    return np.where((one != 0) & (other != 0), mean, one + other).astype(np.float32)
+    """Pixel by pixel; where metres of one are 0, unknown, the other counts alone."""
+    if not is_geometric:
+        return ((one + other) / 2).astype(np.float32)
+    return np.where((one != 0) & (other != 0), np.sqrt(one * other), one + other).astype(np.float32)

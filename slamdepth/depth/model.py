@@ -22,7 +22,7 @@ from slamdepth.depth.head import HeadEnsemble, load_head
 from slamdepth.depth.preprocess import (
     CANONICAL_FOCAL_PX,
     check_size,
-    focal_factor,
+    focal_px_at,
     input_size,
     normalised,
     resize_rgb,
@@ -146,7 +146,7 @@ class Dinov2Depth:
             tapped = self._backbone(image.to(self._dtype), self._head.shape.taps)
             tokens = torch.stack([grid for grid, _ in tapped], dim=1).float()
             class_tokens = torch.stack([token for _, token in tapped], dim=1).float()
-        focal_px = CANONICAL_FOCAL_PX * focal_factor(frame.camera, rows, columns)
+        focal_px = focal_px_at(frame.camera, rows, columns)
         return _Seen(Look(tokens, (rows, columns), focal_px, turn_rad), class_tokens, image, frame)
 
     def _down(self, frame: Frame, looks: _Looks) -> DownEstimate | None:

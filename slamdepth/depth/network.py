@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slamdepth.depth.card import ModelCard
-from slamdepth.depth.preprocess import check_size
-from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
+from slamdepth.depth.preprocess import check_size, focal_px_at
+from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 
 
 class NetworkDepth(ABC):
@@ -52,12 +51,5 @@ class NetworkDepth(ABC):
         check_size(frame)
         values, size = self.infer(frame.image_rgb)
         if self.kind is DepthKind.METRIC and self.card.native_focal_px is not None:
-            values = values * np.float32(focal_ratio(frame.camera, size, self.card.native_focal_px))
+            values = values * np.float32(focal_px_at(frame.camera, *size) / self.card.native_focal_px)
         return DepthPrediction(np.ascontiguousarray(values, dtype=np.float32), self.kind)
-
-
-def focal_ratio(camera: Camera, size: tuple[int, int], native_focal_px: float) -> float:
-    """Focal length of ``camera``'s image resized to ``size`` (rows, columns) over the native one."""
-    rows, columns = size
-    scaled = camera.scaled(columns, rows)
-    return math.sqrt(scaled.fx * scaled.fy) / native_focal_px

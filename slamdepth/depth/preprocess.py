@@ -23,7 +23,7 @@ CANONICAL_FOCAL_PX = 280.0
 """Focal length, in pixels of the network's input, at which log depth is predicted.
 
 Depth seen through a lens twice as long looks half as far, so the network predicts
-``z * CANONICAL_FOCAL_PX / f`` and :func:`focal_factor` undoes it.
+``z * CANONICAL_FOCAL_PX / f`` and ``f / CANONICAL_FOCAL_PX`` undoes it.
 """
 
 SMALLEST_SIDE = 28
@@ -49,10 +49,10 @@ def input_size(height: int, width: int, input_px: int = INPUT_PX) -> tuple[int, 
     return rows, columns
 
 
-def focal_factor(camera: Camera, rows: int, columns: int) -> float:
-    """Metres per canonical metre for the image of ``camera`` resized to ``rows`` x ``columns``."""
+def focal_px_at(camera: Camera, rows: int, columns: int) -> float:
+    """Focal length of ``camera``'s image resized to ``rows`` x ``columns``, pixels: of both axes the mean."""
     scaled = camera.scaled(columns, rows)
-    return math.sqrt(scaled.fx * scaled.fy) / CANONICAL_FOCAL_PX
+    return math.sqrt(scaled.fx * scaled.fy)
 
 
 def resize_rgb(image_rgb: NDArray[np.uint8], rows: int, columns: int) -> NDArray[np.uint8]:

@@ -21,8 +21,7 @@ from torch.nn import functional as F
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2_mlp import SIDE, MlpHead, token_features
-from slamdepth.depth.network import focal_ratio
-from slamdepth.depth.preprocess import normalised, resize_rgb
+from slamdepth.depth.preprocess import focal_px_at, normalised, resize_rgb
 from slamdepth.depth.training.data import Place, fingerprint
 from slamdepth.depth.training.progress import Progress, TrainStep, silent
 from slamdepth.errors import ConfigError
@@ -96,7 +95,7 @@ def read_pairs(places: Sequence[Place]) -> MlpPairs:
             assert frame.depth_m is not None
             images.append(resize_rgb(frame.image_rgb, SIDE, SIDE))
             depths.append(cv2.resize(frame.depth_m, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST))
-            focals.append(focal_ratio(frame.camera, (SIDE, SIDE), 1.0))
+            focals.append(focal_px_at(frame.camera, SIDE, SIDE))
     return MlpPairs(np.stack(images), np.stack(depths).astype(np.float32), np.array(focals))
 
 
