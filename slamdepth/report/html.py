@@ -8,6 +8,7 @@ from importlib import resources
 from typing import Any
 
 from slamdepth.report import plots
+from slamdepth.report.axes import about_views
 from slamdepth.report.data import ReportData
 from slamdepth.report.markup import collapsed, plot, section, settings_table, table, tile
 from slamdepth.report.pictures import NEAR_TO_FAR, UNKNOWN, Gallery, keyframe_gallery
@@ -100,7 +101,7 @@ def _trajectory(data: ReportData, summary: dict[str, Any]) -> str:
     score = data.trajectory_score
     body = plot(
         plots.trajectory_plot(data.reconstruction, score),
-        "The path in the frame of the first camera, after optimisation."
+        f"The path after optimisation. {about_views(data.reconstruction.down_w)}"
         + (" Thin lines join each pose to its ground truth, aligned by SE(3)." if score else ""),
     )
     if score is None:
@@ -228,7 +229,9 @@ def _map(data: ReportData, summary: dict[str, Any]) -> str:
     ]
     intro = "Sparse points come from tracking, the mesh from fusing the keyframes' depth."
     chart = plot(
-        plots.map_plot(data.reconstruction), "Sparse points (grey), the path, and the keyframes as dots."
+        plots.map_plot(data.reconstruction),
+        "Sparse points (grey), the path, and the keyframes as dots. "
+        + about_views(data.reconstruction.down_w),
     )
     return section("Map", intro, chart + table([], rows))
 

@@ -3,19 +3,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slamdepth.geometry import invert, transform
 from slamdepth.report import figure as fig
+from slamdepth.report.axes import drawing_views
 from slamdepth.types import TrackingStatus
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from slamdepth.evaluation import RelativeError, TrajectoryScore
+    from slamdepth.report.axes import View
     from slamdepth.types import Keyframe, Reconstruction, StepResult
 
     Array = NDArray[np.float64]
@@ -25,23 +26,6 @@ _MAX_MAP_POINTS = 20_000
 _CLOUD = "#8391a7"
 
 
-@dataclass(frozen=True)
-class _View:
-    """A projection along one axis of the first camera."""
-
-    title: str
-    axes: tuple[int, int]
-    signs: tuple[int, int]
-    labels: tuple[str, str]
-
-    def flat(self, points: Array) -> Array:
-        return points[:, list(self.axes)] * np.array(self.signs)
-
-
-_VIEWS = (
-    _View("from above", (0, 2), (1, 1), ("right (m)", "forward (m)")),
-    _View("from the side", (2, 1), (1, -1), ("forward (m)", "up (m)")),
-)
 _STATUS_COLOURS = {
     TrackingStatus.INITIALISING: fig.MUTED,
     TrackingStatus.TRACKING: fig.GOOD,
@@ -52,7 +36,7 @@ _STATUS_COLOURS = {
 
 
 def trajectory_plot(run: Reconstruction, score: TrajectoryScore | None) -> str | None:
-    """The path from above and from the side in the frame of the first camera."""
+    """The path from above and from the side, see :func:`drawing_views`."""
     if len(run.trajectory) == 0:
         return None
     path = run.trajectory.T_world_camera[:, :3, 3]
@@ -70,9 +54,10 @@ def trajectory_plot(run: Reconstruction, score: TrajectoryScore | None) -> str |
         ends = np.stack([truth, score.estimate_m, np.full_like(truth, np.nan)], axis=1)[::step]
         links = ends.reshape(-1, 3)
 
+    views = drawing_views(run.down_w)
     with fig.styled("trajectory"):
         figure, axes = fig.new_figure(_WIDTH, 4.6, 1, 2)
-        for panel, view in zip(axes[0], _VIEWS, strict=True):
+        for panel, view in zip(axes[0], views, strict=True):
             if links is not None:
                 panel.plot(*view.flat(links).T, color=fig.MUTED, lw=0.5, alpha=0.6)
             for positions, colour, style, label in lines:
@@ -81,11 +66,11 @@ def trajectory_plot(run: Reconstruction, score: TrajectoryScore | None) -> str |
             _frame(panel, view, view.flat(np.concatenate([line[0] for line in lines])))
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-        return fig.to_svg(figure, "Trajectory from above and from the side")
+        return fig.to_svg(figure, f"Trajectory: {views[0].title}, {views[1].title}")
 
 
 def map_plot(run: Reconstruction) -> str | None:
-    """The sparse map from above and from the side, with the path through it."""
+    """The sparse map from above and from the side, see :func:`drawing_views`, with the path through it."""
     cloud = run.points_m[np.isfinite(run.points_m).all(axis=1)]
     if len(cloud) == 0 or len(run.trajectory) == 0:
         return None
@@ -95,14 +80,15 @@ def map_plot(run: Reconstruction) -> str | None:
     path = run.trajectory.T_world_camera[:, :3, 3]
     broken = _with_gaps(run.trajectory.timestamps_s, path)
     places = np.array([keyframe.T_world_camera[:3, 3] for keyframe in run.keyframes]).reshape(-1, 3)
+    views = drawing_views(run.down_w)
     with fig.styled("map"):
         figure, axes = fig.new_figure(_WIDTH, 4.4, 1, 2)
-        for panel, view in zip(axes[0], _VIEWS, strict=True):
+        for panel, view in zip(axes[0], views, strict=True):
             panel.plot(*view.flat(cloud).T, ".", color=_CLOUD, ms=2.2, alpha=0.6, mew=0, rasterized=True)
             panel.plot(*view.flat(broken).T, color=fig.ESTIMATE)
             panel.plot(*view.flat(places).T, "o", color=fig.ESTIMATE, ms=2.2)
             _frame(panel, view, view.flat(np.concatenate([near, path])))
-        return fig.to_svg(figure, "Sparse map from above and from the side")
+        return fig.to_svg(figure, f"Sparse map: {views[0].title}, {views[1].title}")
 
 
 def tracking_plot(steps: tuple[StepResult, ...]) -> str | None:
@@ -259,7 +245,7 @@ def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(changes[::2], changes[1::2], strict=True)]
 
 
-def _frame(panel: Any, view: _View, points: Array) -> None:
+def _frame(panel: Any, view: View, points: Array) -> None:
     """Titles, equal scales, and limits a little wider than the ``(N, 2)`` points."""
     from matplotlib.ticker import MaxNLocator
 
