@@ -51,8 +51,8 @@ def test_the_version() -> None:
 
 def test_a_run_writes_everything_it_promises(run_folder: Path) -> None:
     promised = (
-        "trajectory_online.txt trajectory.txt keyframes.txt mesh.ply report.json report.html config.yaml "
-        "log.txt README.txt"
+        "trajectory_online.txt trajectory.txt keyframes.txt mesh.ply mesh.png report.json report.html "
+        "config.yaml log.txt README.txt"
     )
     assert {path.name for path in run_folder.iterdir()} == {*promised.split(), "stdout.txt"}
     online, _ = read_tum_trajectory(run_folder / "trajectory_online.txt")
@@ -61,6 +61,7 @@ def test_a_run_writes_everything_it_promises(run_folder: Path) -> None:
     assert online.timestamps_s.tolist() == final.timestamps_s.tolist()
     assert set(keyframes.timestamps_s) <= set(final.timestamps_s)
     assert (run_folder / "mesh.ply").read_bytes().startswith(b"ply\n")
+    assert (run_folder / "mesh.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_room_is_tracked(report: dict[str, Any]) -> None:
@@ -126,7 +127,7 @@ def test_the_same_command_gives_the_same_bytes(run_folder: Path, tiny_room: Path
     again = tmp_path / "again"
     done = slamdepth("run", tiny_room, "--config", run_folder / "config.yaml", "--output", again, "--quiet")
     assert done.returncode == 0, done.stderr
-    for name in ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "mesh.ply"):
+    for name in ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "mesh.ply", "mesh.png"):
         assert (again / name).read_bytes() == (run_folder / name).read_bytes(), name
 
 
@@ -170,6 +171,8 @@ def test_stride_limit_and_no_mesh(tiny_room: Path, tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert not (folder / "mesh.ply").exists()
+    assert not (folder / "mesh.png").exists()
+    assert "no picture of one" in (folder / "report.html").read_text(encoding="utf-8")
     times = read_tum_trajectory(folder / "trajectory.txt")[0].timestamps_s
     expected = read_tum_trajectory(tiny_room / "groundtruth.txt")[0].timestamps_s[:12:2]
     assert times.tolist() == expected.tolist()

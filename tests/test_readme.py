@@ -52,7 +52,7 @@ def test_the_run_folder_is_explained() -> None:
     from slamdepth.pipeline.folder import FILES
 
     section = README.split("### What a run leaves behind")[1].split("###")[0]
-    assert set(re.findall(r"`(\w+\.(?:txt|ply|html|json|yaml))`", section)) == set(FILES)
+    assert set(re.findall(r"`(\w+\.(?:txt|ply|png|html|json|yaml))`", section)) == set(FILES)
 
 
 def test_linked_files_exist() -> None:

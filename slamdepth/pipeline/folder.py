@@ -22,6 +22,7 @@ FILES = {
     "keyframes.txt": "the keyframes of trajectory.txt",
     "depth_scale.yaml": "the scale fitted to the sequence's own sensor (--depth-scale groundtruth)",
     "mesh.ply": "coloured mesh of the scene in the frame of the first camera, metres",
+    "mesh.png": "the mesh as a whole with the camera's path, and over the camera's shoulder",
     "report.html": "figures and plots of the run; opens in any browser, needs nothing else",
     "report.json": "the same figures for programs",
     "config.yaml": "the settings used, for --config; which images and which camera are not among them",

@@ -13,7 +13,7 @@ from slamdepth.datasets import Dataset
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.evaluation import DepthScore, DepthScorer, TrajectoryScore, score_trajectory
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, Stage
-from slamdepth.report import MeshCounts
+from slamdepth.report import MeshCounts, MeshPicture, mesh_pictures
 from slamdepth.types import DepthKind, Keyframe, Reconstruction, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -32,11 +32,11 @@ def keyframe_trajectory(reconstruction: Reconstruction) -> Trajectory:
 
 def write_keyframe_mesh(
     reconstruction: Reconstruction, config: Config, path: Path, progress: ProgressCallback
-) -> tuple[MeshCounts | None, tuple[str, ...]]:
+) -> tuple[MeshCounts | None, tuple[MeshPicture, ...], tuple[str, ...]]:
     """Fuse the keyframes and write the mesh.
 
     Returns:
-        Its size, or None where there is no surface and no file; and notes.
+        Its size, or None where there is no surface and no file; pictures of it; and notes.
 
     Raises:
         OutputError: ``path`` cannot be written.
@@ -49,9 +49,10 @@ def write_keyframe_mesh(
 
     mesh = fuse_keyframes(reconstruction.keyframes, config.map, tell)
     if len(mesh.triangles) == 0:
-        return None, mesh.notes
+        return None, (), mesh.notes
     write_mesh(path, mesh)
-    return MeshCounts(len(mesh.vertices_m), len(mesh.triangles)), mesh.notes
+    counts = MeshCounts(len(mesh.vertices_m), len(mesh.triangles))
+    return counts, mesh_pictures(mesh, reconstruction), mesh.notes
 
 
 def judge_trajectory(

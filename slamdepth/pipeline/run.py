@@ -42,7 +42,7 @@ from slamdepth.pipeline.results import (
 )
 from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.tracking import Tracked, track
-from slamdepth.report import MeshCounts, ReportData, write_report
+from slamdepth.report import MeshCounts, MeshPicture, ReportData, write_mesh_png, write_report
 
 logger = logging.getLogger(__name__)
 
@@ -157,19 +157,23 @@ def _finish(
     notes = [*dataset.notes, *tracked.notes, *scale_notes]
 
     mesh: MeshCounts | None = None
+    pictures: tuple[MeshPicture, ...] = ()
     if options.mesh:
         tell(RunProgress(Stage.MESHING))
         try:
-            mesh, mesh_notes = write_keyframe_mesh(reconstruction, config, folder / "mesh.ply", tell)
+            mesh, pictures, mesh_notes = write_keyframe_mesh(
+                reconstruction, config, folder / "mesh.ply", tell
+            )
         except SlamdepthError as error:
             mesh_notes = (f"no mesh: {error}",)
         for note in mesh_notes:
             logger.warning("%s", note)
         notes += mesh_notes
+    if pictures:
+        write_mesh_png(folder / "mesh.png", pictures)
 
-    absent = {
-        name for name, is_there in (("mesh.ply", mesh), ("depth_scale.yaml", scale.fit)) if not is_there
-    }
+    optional = (("mesh.ply", mesh), ("mesh.png", pictures), ("depth_scale.yaml", scale.fit))
+    absent = {name for name, is_there in optional if not is_there}
     tell(RunProgress(Stage.SCORING))
     trajectory_score, score_notes = judge_trajectory(dataset, reconstruction.trajectory)
     notes += score_notes
@@ -187,6 +191,7 @@ def _finish(
             trajectory_score=trajectory_score,
             depth_score=score_depth(dataset, reconstruction.keyframes),
             mesh=mesh,
+            mesh_pictures=pictures,
             skipped_frames=tracked.skipped,
             notes=tuple(notes),
             options=_reported_options(options, tracked),

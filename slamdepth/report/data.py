@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from slamdepth.config import Config
 from slamdepth.evaluation import DepthScore, TrajectoryScore
+from slamdepth.report.mesh_pictures import MeshPicture
 from slamdepth.report.scale import ScaleFacts
 from slamdepth.types import Reconstruction, StepResult, WeightsInfo
 
@@ -33,6 +34,7 @@ class ReportData:
         weights: every weights file that took part, and the data each has seen.
         steps: one result for each frame, in order; empty where they were not kept.
         trajectory_score, depth_score, mesh: None where there is none.
+        mesh_pictures: views of the mesh; empty where there is none.
         skipped_frames: images that could not be read: damaged, or missing.
         notes: what was guessed, dropped or repaired, one line each.
         options: what was asked on the command line beside the settings.
@@ -50,6 +52,7 @@ class ReportData:
     trajectory_score: TrajectoryScore | None = None
     depth_score: DepthScore | None = None
     mesh: MeshCounts | None = None
+    mesh_pictures: tuple[MeshPicture, ...] = ()
     skipped_frames: int = 0
     notes: tuple[str, ...] = ()
     options: dict[str, object] = field(default_factory=dict)

@@ -11,7 +11,7 @@ from slamdepth.report import plots
 from slamdepth.report.axes import about_views
 from slamdepth.report.data import ReportData
 from slamdepth.report.markup import collapsed, plot, section, settings_table, table, tile
-from slamdepth.report.pictures import NEAR_TO_FAR, UNKNOWN, Gallery, keyframe_gallery
+from slamdepth.report.pictures import NEAR_TO_FAR, UNKNOWN, Gallery, jpeg_address, keyframe_gallery
 from slamdepth.report.text import MISSING, count, fixed, percent
 
 
@@ -233,7 +233,18 @@ def _map(data: ReportData, summary: dict[str, Any]) -> str:
         "Sparse points (grey), the path, and the keyframes as dots. "
         + about_views(data.reconstruction.down_w),
     )
-    return section("Map", intro, chart + table([], rows))
+    return section("Map", intro, chart + _mesh(data) + table([], rows))
+
+
+def _mesh(data: ReportData) -> str:
+    if not data.mesh_pictures:
+        return '<p class="why">There is no mesh, so there is no picture of one.</p>' if not data.mesh else ""
+    figures = "".join(
+        f'<figure><img src="{jpeg_address(picture.image_rgb)}" alt="{escape(picture.title)}">'
+        f"<figcaption><b>{escape(picture.title)}.</b> {escape(picture.caption)}</figcaption></figure>"
+        for picture in data.mesh_pictures
+    )
+    return f'<h3>The mesh</h3><div class="gallery">{figures}</div>'
 
 
 def _speed(summary: dict[str, Any]) -> str:

@@ -93,19 +93,26 @@ def _picture(keyframe: Keyframe, start_s: float, near_m: float, far_m: float) ->
     return KeyframePicture(
         id=keyframe.id,
         seconds=keyframe.frame.timestamp_s - start_s,
-        image=_jpeg(keyframe.frame.image_rgb, smooth=True),
-        depth=_jpeg(colour_depth(keyframe.depth_m, near_m, far_m), smooth=False),
-        sensor=None if sensor_m is None else _jpeg(colour_depth(sensor_m, near_m, far_m), smooth=False),
+        image=_small(keyframe.frame.image_rgb, smooth=True),
+        depth=_small(colour_depth(keyframe.depth_m, near_m, far_m), smooth=False),
+        sensor=None if sensor_m is None else _small(colour_depth(sensor_m, near_m, far_m), smooth=False),
     )
 
 
-def _jpeg(image_rgb: NDArray[np.uint8], *, smooth: bool) -> str:
+def _small(image_rgb: NDArray[np.uint8], *, smooth: bool) -> str:
     import cv2
 
     height, width = image_rgb.shape[:2]
     size = (_WIDTH_PX, max(1, round(height * _WIDTH_PX / width)))
     small = cv2.resize(image_rgb, size, interpolation=cv2.INTER_AREA if smooth else cv2.INTER_NEAREST)
-    _, data = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 84])
+    return jpeg_address(np.asarray(small, np.uint8))
+
+
+def jpeg_address(image_rgb: NDArray[np.uint8]) -> str:
+    """The picture ``(H, W, 3)`` as a JPEG in a ``data:`` address."""
+    import cv2
+
+    _, data = cv2.imencode(".jpg", image_rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 84])
     return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 

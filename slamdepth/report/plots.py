@@ -10,6 +10,7 @@ import numpy as np
 from slamdepth.geometry import invert, transform
 from slamdepth.report import figure as fig
 from slamdepth.report.axes import drawing_views
+from slamdepth.report.gaps import gap_ends
 from slamdepth.types import TrackingStatus
 
 if TYPE_CHECKING:
@@ -222,21 +223,15 @@ def scale_plot(keyframes: tuple[Keyframe, ...]) -> str | None:
         return fig.to_svg(figure, "Factor applied to the predicted depth of each keyframe")
 
 
-def _gap_ends(times: Array) -> NDArray[np.int64]:
-    """Indices before which a curve must be broken: pauses of over 2.5 times the usual spacing."""
-    spacing = np.diff(times)
-    return np.flatnonzero(spacing > 2.5 * np.median(spacing)) + 1 if len(spacing) else np.empty(0, np.int64)
-
-
 def _with_gaps(times: Array, values: Array) -> Array:
     """Rows ``values (N, D)`` with a row of NaN in each pause, so that no line bridges lost frames."""
-    return np.insert(values.astype(np.float64), _gap_ends(times), np.nan, axis=0)
+    return np.insert(values.astype(np.float64), gap_ends(times), np.nan, axis=0)
 
 
 def _gap_times(times: Array, start_s: float | None = None) -> Array:
     """Seconds since ``start_s`` that belong to the rows of :func:`_with_gaps`."""
     seconds = times - (times[0] if start_s is None else start_s)
-    return np.insert(seconds, _gap_ends(times), np.nan)
+    return np.insert(seconds, gap_ends(times), np.nan)
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:

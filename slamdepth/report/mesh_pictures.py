@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of the finished mesh: as a whole, and as somebody behind the camera would see it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.geometry import invert, project, transform
+from slamdepth.io import write_png
+from slamdepth.mapping.raycast import render_mesh
+from slamdepth.report.gaps import gap_ends
+from slamdepth.report.viewpoints import from_above, guessed_down, over_the_shoulder, picture_camera
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from slamdepth.mapping.mesh import TriangleMesh
+    from slamdepth.types import Camera, Reconstruction, Trajectory
+
+_WIDTH, _HEIGHT = 900, 600
+_BACKGROUND = (205, 211, 219)
+_PATH, _CASING = (23, 105, 212), (255, 255, 255)
+_SUBPIXELS = 4  # bits
+
+
+@dataclass(frozen=True)
+class MeshPicture:
+    """One view of a mesh.
+
+    Attributes:
+        title: what is seen, in a few words.
+        caption: what else one needs to read it.
+        image_rgb: ``(H, W, 3)`` uint8.
+    """
+
+    title: str
+    caption: str
+    image_rgb: NDArray[np.uint8]
+
+
+def mesh_pictures(mesh: TriangleMesh, run: Reconstruction) -> tuple[MeshPicture, ...]:
+    """Views of ``mesh``, none where it has no triangle or ``run`` no pose.
+
+    Up is against gravity where ``run`` knows it, else guessed from how the camera was held; a picture
+    claims nothing about that.
+
+    Raises:
+        SlamdepthError: Open3D is not installed.
+    """
+    poses = run.trajectory.T_world_camera
+    if len(mesh.triangles) == 0 or len(poses) == 0:
+        return ()
+    down_w = guessed_down(poses) if run.down_w is None else run.down_w
+    level = (
+        "upright by gravity"
+        if run.down_w is not None
+        else "which way is up is guessed from how the camera was held"
+    )
+    wide = picture_camera(_WIDTH, _HEIGHT, 50.0)
+    T = from_above(mesh, poses[:, :3, 3], down_w, wide)
+    whole = render_mesh(mesh, wide, T, _BACKGROUND)
+    pictures = [
+        MeshPicture(
+            "The whole mesh, from above and behind the camera",
+            f"The path of the camera is blue, with a dot at its start; {level}. Surfaces seen from behind "
+            "are left out, so that one looks through walls and ceilings into the room. Nothing is drawn "
+            "where no keyframe saw a surface.",
+            _with_path(whole, run.trajectory, wide, T),
+        )
+    ]
+    near = picture_camera(_WIDTH, _HEIGHT, 65.0)
+    if (behind := over_the_shoulder(mesh, poses, down_w, near)) is not None:
+        pictures.append(
+            MeshPicture(
+                "Over the camera's shoulder",
+                "A step behind that place of the path from which most of the mesh is seen; to be compared "
+                "with the images.",
+                render_mesh(mesh, near, behind, _BACKGROUND),
+            )
+        )
+    return tuple(pictures)
+
+
+def write_mesh_png(path: Path, pictures: tuple[MeshPicture, ...]) -> None:
+    """Write the pictures side by side.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+    """
+    write_png(path, np.hstack([picture.image_rgb for picture in pictures]))
+
+
+def _with_path(
+    image_rgb: NDArray[np.uint8], trajectory: Trajectory, camera: Camera, T_world_camera: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """The picture with the path drawn over it, broken where frames were lost."""
+    import cv2
+
+    px, _ = project(camera, transform(invert(T_world_camera), trajectory.T_world_camera[:, :3, 3]))
+    px = np.round(np.clip(px, -1e4, 1e4) * 2**_SUBPIXELS).astype(np.int32)
+    drawn = image_rgb.copy()
+    parts = [part[:, None] for part in np.split(px, gap_ends(trajectory.timestamps_s)) if len(part) > 1]
+    for colour, width in ((_CASING, 5), (_PATH, 2)):
+        cv2.polylines(drawn, parts, False, colour, width, cv2.LINE_AA, _SUBPIXELS)
+    for colour, radius in ((_CASING, 7), (_PATH, 5)):
+        cv2.circle(drawn, px[0].tolist(), radius << _SUBPIXELS, colour, -1, cv2.LINE_AA, _SUBPIXELS)
+    return drawn
