@@ -326,6 +326,7 @@ class Reconstruction:
         points_m: ``(P, 3)`` float64 map points in the world frame, metres of the map.
         frames, tracked, loop_closures, relocalisations, rescues: counts over the run.
         timings_ms: mean milliseconds per call of each stage.
+        timing_calls: how often each of them was called.
         scale_votes: log ratio of the map's depths to the predicted ones, one for each
             keyframe that could tell; the map's scale is where their robust centre is 0. Empty
             where nothing was voted on, as with a sensor.
@@ -350,3 +351,4 @@ class Reconstruction:
     readout_s: float | None = None
     readout_sigma_s: float | None = None
     down_w: NDArray[np.float64] | None = None
+    timing_calls: dict[str, int] = field(default_factory=dict)

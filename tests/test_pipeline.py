@@ -94,6 +94,8 @@ def test_every_placed_frame_is_in_the_online_trajectory(tmp_path: Path) -> None:
     assert not tracked.interrupted
     assert tracked.fps > 0
     assert {"tracking", "finish", "decode"} <= set(tracked.reconstruction.timings_ms)
+    calls = tracked.reconstruction.timing_calls
+    assert (calls["finish"], calls["decode"]) == (1, len(tracked.steps))
     assert "1 of 10 images do not decode" in " ".join(tracked.notes)
 
 

@@ -39,6 +39,7 @@ from slamdepth.report import (
 )
 from slamdepth.report import plots as report_plots
 from slamdepth.report.pictures import NEAR_TO_FAR, UNKNOWN, colour_depth, keyframe_gallery
+from slamdepth.report.speed import speed_plot, stage_times
 from slamdepth.report.text import count, fixed, percent
 from slamdepth.types import (
     Camera,
@@ -116,6 +117,7 @@ def full_data() -> ReportData:
             relocalisations=1,
             rescues=0,
             timings_ms={"features": 7.5, "depth": 180.0},
+            timing_calls={"features": 80, "depth": 6},
             notes=("the tracker's <note>",),
         ),
         fps=12.5,
@@ -168,6 +170,8 @@ def test_summary_has_the_promised_keys_and_values() -> None:
     assert summary["tracked_fraction"] == 70 / 80
     assert summary["fps"] == 12.5
     assert summary["timings_ms"] == {"features": 7.5, "depth": 180.0}
+    assert summary["timing_calls"] == {"features": 80, "depth": 6}
+    assert summary["wall_s"] == pytest.approx(80 / 12.5)
     score = full_data().trajectory_score
     assert score is not None
     assert summary["ate"]["se3"]["rmse_m"] == score.se3.rmse_m
@@ -277,7 +281,7 @@ def test_plots_are_valid_svg_in_the_colours_of_the_page() -> None:
         "ate": report_plots.ate_plot(score),
         "rpe": report_plots.rpe_plot(score),
         "position": report_plots.position_plot(run, score),
-        "timings": report_plots.timings_plot(run.timings_ms),
+        "timings": speed_plot(stage_times(run.timings_ms, run.timing_calls, 6.4)),
         "scale": report_plots.scale_plot(run.keyframes),
     }
     ids: list[str] = []
@@ -302,7 +306,7 @@ def test_plots_without_data_are_none() -> None:
     assert report_plots.ate_plot(None) is None
     assert report_plots.rpe_plot(None) is None
     assert report_plots.position_plot(run, None) is None
-    assert report_plots.timings_plot({}) is None
+    assert speed_plot(stage_times({}, {}, None)) is None
     assert report_plots.scale_plot(()) is None
     assert report_plots.scale_plot(tuple(keyframe(i, is_sensor=True) for i in range(3))) is None
 

@@ -136,7 +136,10 @@ def test_the_page_shows_them_and_the_file_has_them_side_by_side(tmp_path: Path) 
     without = build_html(full_data(), build_summary(data))
     assert page.count("data:image/jpeg") == without.count("data:image/jpeg") + 2
     write_mesh_png(tmp_path / "mesh.png", pictures)
-    np.testing.assert_array_equal(read_image_rgb(tmp_path / "mesh.png"), np.hstack([image, image // 2]))
+    read = read_image_rgb(tmp_path / "mesh.png")
+    np.testing.assert_array_equal(read[:, :9], image)
+    np.testing.assert_array_equal(read[:, -9:], image // 2)
+    assert (read[:, 9:-9] == 255).all()
     with pytest.raises(OutputError, match="cannot be written"):
         write_mesh_png(tmp_path / "absent" / "mesh.png", pictures)
 

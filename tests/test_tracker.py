@@ -95,6 +95,9 @@ def test_the_reconstruction_is_consistent(
         assert np.isfinite(made.points_m).all()
         assert set(made.timings_ms) >= {"features", "tracking", "depth", "mapping", "bundle"}
         assert all(ms >= 0 for ms in made.timings_ms.values())
+        assert made.timing_calls.keys() == made.timings_ms.keys()
+        assert made.timing_calls["features"] == COUNT
+        assert made.timing_calls["final"] == 1
 
 
 class ToldDown(ConstantDepth):

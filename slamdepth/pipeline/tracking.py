@@ -122,7 +122,11 @@ def track(
     for note in notes:
         logger.warning("%s", note)
     return Tracked(
-        replace(reconstruction, timings_ms=timings_ms),
+        replace(
+            reconstruction,
+            timings_ms=timings_ms,
+            timing_calls={**reconstruction.timing_calls, "finish": 1, "decode": len(steps)},
+        ),
         tuple(steps),
         len(steps) / (end_s - start_s),
         skipped,

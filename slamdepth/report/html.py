@@ -12,6 +12,7 @@ from slamdepth.report.axes import about_views
 from slamdepth.report.data import ReportData
 from slamdepth.report.markup import collapsed, plot, section, settings_table, table, tile
 from slamdepth.report.pictures import NEAR_TO_FAR, UNKNOWN, Gallery, jpeg_address, keyframe_gallery
+from slamdepth.report.speed import speed_caption, speed_plot, stage_times
 from slamdepth.report.text import MISSING, count, fixed, percent
 
 
@@ -248,7 +249,8 @@ def _mesh(data: ReportData) -> str:
 
 
 def _speed(summary: dict[str, Any]) -> str:
-    chart = plot(plots.timings_plot(summary["timings_ms"]), "Mean wall time of one call of each stage.")
+    times = stage_times(summary["timings_ms"], summary["timing_calls"], summary["wall_s"])
+    chart = plot(speed_plot(times), speed_caption(summary["wall_s"]))
     intro = (
         f"{fixed(summary['fps'], 1)} frames a second: all frames over the wall time of tracking, depth "
         "prediction and optimisation; meshing is apart."

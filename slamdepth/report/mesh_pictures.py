@@ -25,6 +25,7 @@ _WIDTH, _HEIGHT = 900, 600
 _BACKGROUND = (205, 211, 219)
 _PATH, _CASING = (23, 105, 212), (255, 255, 255)
 _SUBPIXELS = 4  # bits
+_STRIPE = 8  # pixels
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,14 @@ def mesh_pictures(mesh: TriangleMesh, run: Reconstruction) -> tuple[MeshPicture,
 
 
 def write_mesh_png(path: Path, pictures: tuple[MeshPicture, ...]) -> None:
-    """Write the pictures side by side.
+    """Write the pictures side by side, a white stripe between them.
 
     Raises:
         OutputError: ``path`` cannot be written.
     """
-    write_png(path, np.hstack([picture.image_rgb for picture in pictures]))
+    stripe = np.full((pictures[0].image_rgb.shape[0], _STRIPE, 3), 255, np.uint8)
+    row = [part for picture in pictures for part in (stripe, picture.image_rgb)]
+    write_png(path, np.hstack(row[1:]))
 
 
 def _with_path(

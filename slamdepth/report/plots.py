@@ -187,25 +187,6 @@ def position_plot(run: Reconstruction, score: TrajectoryScore | None) -> str | N
         return fig.to_svg(figure, "Position of the camera over time")
 
 
-def timings_plot(timings_ms: dict[str, float]) -> str | None:
-    """Mean wall time of a call of each stage."""
-    stages = sorted(((ms, name) for name, ms in timings_ms.items() if np.isfinite(ms)), reverse=True)
-    if not stages:
-        return None
-    with fig.styled("timings"):
-        figure, axes = fig.new_figure(_WIDTH, 0.5 + 0.26 * len(stages))
-        panel = axes[0, 0]
-        values = [ms for ms, _ in stages]
-        bars = panel.barh([name.replace("_", " ") for _, name in stages], values, 0.62, color=fig.ESTIMATE)
-        panel.bar_label(bars, labels=[f"{ms:.1f}" for ms in values], padding=4, color=fig.INK)
-        panel.set(xlabel="milliseconds per call", xlim=(0, 1.1 * max(values) or 1.0))
-        panel.invert_yaxis()
-        panel.grid(False, axis="y")
-        panel.spines["left"].set_visible(False)
-        panel.tick_params(axis="y", length=0, labelcolor=fig.INK)
-        return fig.to_svg(figure, "Milliseconds per call of each stage")
-
-
 def scale_plot(keyframes: tuple[Keyframe, ...]) -> str | None:
     """The factor that turned each keyframe's predicted depth into metres of the map."""
     scales = np.array([keyframe.depth_scale for keyframe in keyframes if not keyframe.prediction.is_sensor])

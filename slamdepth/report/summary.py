@@ -31,6 +31,8 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         "fps": data.fps,
         "rolling_shutter": shutter_facts(run, data.config.shutter.readout_ms is not None),
         "timings_ms": dict(run.timings_ms),
+        "timing_calls": dict(run.timing_calls),
+        "wall_s": run.frames / data.fps if data.fps > 0 else None,
         **_trajectory(data.trajectory_score),
         "depth": _depth(data.depth_score),
         "mesh": {

@@ -167,4 +167,5 @@ class CloudTracker:
             relocalisations=0,
             rescues=0,
             timings_ms={stage: float(np.mean(values)) for stage, values in self._totals.items()},
+            timing_calls={stage: len(values) for stage, values in self._totals.items()},
         )

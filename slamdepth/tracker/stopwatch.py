@@ -39,3 +39,7 @@ class Stopwatch:
     def mean_ms(self) -> dict[str, float]:
         """Mean over all times a stage was measured."""
         return {stage: total / self._times[stage] for stage, total in self._total_ms.items()}
+
+    def calls(self) -> dict[str, int]:
+        """How often each stage was measured."""
+        return dict(self._times)

@@ -303,6 +303,7 @@ class Tracker:
                 relocalisations=self._finder.relocalisations,
                 rescues=self._finder.rescues,
                 timings_ms=self._watch.mean_ms(),
+                timing_calls=self._watch.calls(),
                 notes=notes,
                 scale_votes=votes,
                 down_w=self._depth.down_w(),
