@@ -55,6 +55,28 @@ def test_a_trajectory_that_cannot_be_scored_is_a_note() -> None:
     assert "not scored" in notes[0]
 
 
+@pytest.mark.parametrize(
+    ("factor", "is_noted"), [(1.0, False), (1.2, False), (0.82, False), (1.3, True), (0.5, True)]
+)
+def test_a_sensor_whose_scale_is_not_the_truths_is_a_note(
+    factor: float, is_noted: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    dataset = MadeUpDataset(30)
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(30, 3))
+    estimate = Trajectory(dataset.timestamps_s, poses)
+    truth = poses.copy()
+    truth[:, :3, 3] *= factor
+    dataset.ground_truth = Trajectory(dataset.timestamps_s, truth)
+    assert judge_trajectory(dataset, estimate)[1] == ()  # a network's map may have any scale
+    score, notes = judge_trajectory(dataset, estimate, is_measured=True)
+    assert score is not None
+    assert score.sim3.scale == pytest.approx(factor)
+    assert len(notes) == is_noted
+    assert all("check depth_factor and the intrinsics" in text for text in (*notes, *caplog.messages))
+    assert len(caplog.messages) == is_noted
+
+
 def test_keyframes_become_a_trajectory() -> None:
     frames = (keyframe(0, 1.0), keyframe(3, 1.0))
     trajectory = Trajectory(np.zeros(0), np.zeros((0, 4, 4)), is_metric=False)

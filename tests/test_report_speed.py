@@ -19,7 +19,7 @@ def test_stages_are_compared_by_what_they_cost_in_all() -> None:
         "placing frames",
         "finding features",
         "the end of the run",
-        "of that: adjusting all",
+        "the end: adjusting all",
     ]
     assert [time.seconds for time in times] == pytest.approx([6.6, 4.8, 1.675, 1.2])
     assert [time.share for time in times] == pytest.approx([0.66, 0.48, 0.1675, 0.12])

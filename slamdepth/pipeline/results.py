@@ -18,6 +18,8 @@ from slamdepth.types import DepthKind, Keyframe, Reconstruction, Trajectory
 
 logger = logging.getLogger(__name__)
 
+_SENSOR_SCALE = 1.25  # times the truth, and its inverse: what no sensor errs by
+
 
 def keyframe_trajectory(reconstruction: Reconstruction) -> Trajectory:
     """The keyframes' poses as a trajectory."""
@@ -56,16 +58,29 @@ def write_keyframe_mesh(
 
 
 def judge_trajectory(
-    dataset: Dataset, estimate: Trajectory
+    dataset: Dataset, estimate: Trajectory, *, is_measured: bool = False
 ) -> tuple[TrajectoryScore | None, tuple[str, ...]]:
-    """Score against the ground truth where there is one; trouble becomes a note."""
+    """Score against the ground truth where there is one; trouble becomes a note.
+
+    Args:
+        is_measured: a sensor's depth made the map, so that its scale should be the truth's.
+    """
     if dataset.ground_truth is None:
         return None, ()
     try:
-        return score_trajectory(dataset.ground_truth, estimate), ()
+        score = score_trajectory(dataset.ground_truth, estimate)
     except DatasetError as error:
         logger.warning("the trajectory is not scored: %s", error)
         return None, (f"the trajectory is not scored: {error}",)
+    factor = score.sim3.scale
+    if not is_measured or 1 / _SENSOR_SCALE <= factor <= _SENSOR_SCALE:
+        return score, ()
+    note = (
+        f"a sensor measured the depth, yet the map would have to be multiplied by {factor:.3g} to fit the "
+        "ground truth: check depth_factor and the intrinsics, and the unit of the ground truth"
+    )
+    logger.warning("%s", note)
+    return score, (note,)
 
 
 def score_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore | None:

@@ -175,7 +175,9 @@ def _finish(
     optional = (("mesh.ply", mesh), ("mesh.png", pictures), ("depth_scale.yaml", scale.fit))
     absent = {name for name, is_there in optional if not is_there}
     tell(RunProgress(Stage.SCORING))
-    trajectory_score, score_notes = judge_trajectory(dataset, reconstruction.trajectory)
+    trajectory_score, score_notes = judge_trajectory(
+        dataset, reconstruction.trajectory, is_measured=config.depth.name == "sensor"
+    )
     notes += score_notes
     summary = write_report(
         folder.path,

@@ -18,7 +18,7 @@ _NAMES = {
     "bundle": "adjusting the map near by",
     "loops": "closing loops",
     "finish": "the end of the run",
-    "final": "of that: adjusting all",
+    "final": "the end: adjusting all",
 }
 _BESIDE = ("decode", "features", "final")
 _WIDTH = 9.6
