@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from slamdepth.depth import weights as store
 from slamdepth.depth.card import ModelCard
 from slamdepth.depth.dinov2_mlp import SIDE, MlpHead, at_size, load_mlp
-from slamdepth.depth.network import NetworkDepth, focal_ratio
-from slamdepth.depth.preprocess import resize_rgb
+from slamdepth.depth.network import NetworkDepth
+from slamdepth.depth.preprocess import focal_px_at, resize_rgb
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 
 PIXELS = 3 * SIDE * SIDE
@@ -48,7 +48,7 @@ class MeanImageDepth:
 
     def predict(self, frame: Frame) -> DepthPrediction:
         """``(H, W)`` metres, scaled to the frame's focal length."""
-        factor = focal_ratio(frame.camera, self.depth_m.shape, self.focal_px)
+        factor = focal_px_at(frame.camera, *self.depth_m.shape) / self.focal_px
         full = at_size(torch.from_numpy(self.depth_m)[None], *frame.image_rgb.shape[:2])
         return DepthPrediction(full * np.float32(factor), self.kind)
 

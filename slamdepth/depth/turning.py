@@ -54,9 +54,8 @@ def turned_back(
     values = np.exp(log_taken + share * change).astype(np.float32)
     sigma = as_taken.sigma_log
     if upright.sigma_log is not None and sigma is not None:
-        counts = share * inside
-        turned_sigma = _back(upright.sigma_log, camera, roll_rad)
-        sigma = (counts * turned_sigma + (1 - counts) * sigma).astype(np.float32)
+        taken, turned_sigma = sigma.astype(np.float64), _back(upright.sigma_log, camera, roll_rad)
+        sigma = (taken + share * inside * (turned_sigma - taken)).astype(np.float32)
     return replace(as_taken, values=values, sigma_log=sigma)
 
 
