@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth import depth
 from slamdepth.datasets import Dataset
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.weights import cache_dir
 from slamdepth.errors import ConfigError, ImageDecodeError
 from slamdepth.io import replacing
+from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.types import DepthKind
 
 if TYPE_CHECKING:
@@ -33,6 +35,14 @@ def default_cache() -> Path:
     return cache_dir() / "benchmarks"
 
 
+def _code_sha256() -> str:
+    """Of all that makes depth of images, trainings apart."""
+    hashed = hashlib.sha256()
+    for file in sorted(Path(depth.__file__).parent.glob("*.py")):
+        hashed.update(file.read_bytes())
+    return hashed.hexdigest()
+
+
 @dataclass(frozen=True)
 class DepthCache:
     """One model's predictions for one sequence, a file a frame."""
@@ -41,13 +51,15 @@ class DepthCache:
 
     @classmethod
     def of(cls, root: Path, dataset: Dataset, model: DepthModel) -> DepthCache:
-        """The folder below ``root``; other weights, camera or frames have another one."""
+        """The folder below ``root``; other weights, camera or frames, or other code that predicts, have
+        another one."""
         camera = dataset.camera
         identity = "\n".join(
             [
                 *(f"{info.name} {info.sha256}" for info in model.weights),
+                _code_sha256(),
                 f"{camera}",
-                f"{len(dataset)} {dataset.timestamps_s[0]:.6f} {dataset.timestamps_s[-1]:.6f}",
+                sequence_id(dataset),
             ]
         )
         digest = hashlib.sha256(identity.encode()).hexdigest()[:12]
