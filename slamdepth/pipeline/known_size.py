@@ -28,7 +28,7 @@ HEIGHT_SIGMA_LOG = 0.03
 """How well a camera's height over a floor is known to people, and a floor is level."""
 PREDICTED_HEIGHT_SIGMA_LOG = 0.12
 """How far a floor of predicted depth lies from the map's own scale: a network errs on floors as a
-whole, which keyframes don't average out. 14 % too high in the rendered room, where it is known."""
+whole, which keyframes don't average out. With an earlier head it was 14 % in the rendered room."""
 LENGTH_SIGMA_LOG = 0.01
 """How well people measure a distance."""
 SENSOR_SIGMA_LOG = 0.03

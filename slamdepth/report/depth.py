@@ -48,6 +48,7 @@ _CURVES = {
 }
 _DOUBLING = tuple(2.0**k for k in range(-6, 9))
 _BETWEEN = tuple(1.5 * place for place in _DOUBLING)
+_APART_FROM_ONE = (0.06, 0.12, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 8.0, 16.0)
 _AROUND_ONE = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 1.75, 2.0, 2.5)
 
 
@@ -212,7 +213,7 @@ def write_over_depth(path: Path, judgements: Mapping[str, DepthJudgement], title
     low, high = 0.97 * np.nanmin(ratios), 1.03 * np.nanmax(ratios)
     bias.set_ylim(low, high)
     _set_ticks(shares.xaxis, _DOUBLING if far / near > 16 else sorted((*_DOUBLING, *_BETWEEN)))
-    _set_ticks(bias.yaxis, _AROUND_ONE if high / low < 3 else _DOUBLING)
+    _set_ticks(bias.yaxis, _AROUND_ONE if high / low < 3 else _APART_FROM_ONE)
     write_png(figure, path)
 
 
