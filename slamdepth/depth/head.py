@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The depth head: DINOv2 tokens and the image in, log depth and its uncertainty out.
 
-Tokens of several blocks (and class tokens, where scale is not told apart) are mixed at 1/14 of the resolution,
-brought to 1/7 together with a strided view of the image, and upsampled to the full input
+Tokens of several blocks (and class tokens, where scale is not told apart) are mixed at 1/14 of the
+resolution, brought to 1/7 together with a strided view of the image, and upsampled to the full input
 as convex combinations of the 3 x 3 coarse neighbours (Teed and Deng, RAFT, ECCV 2020):
 the weights come from the image, so edges stay where the image has them.
 """
