@@ -277,6 +277,16 @@ def test_other_settings_need_overwrite(tmp_path: Path) -> None:
     assert (out / "mine.txt").read_text() == "kept"
 
 
+def test_another_sequence_of_the_same_name_is_another(tmp_path: Path) -> None:
+    """All of 7-Scenes are called seq-NN."""
+    chess, fire = (tmp_path / scene / "seq-01" for scene in ("chess", "fire"))
+    out = tmp_path / "out"
+    make(make_tum(chess, 3), out, "sensor")
+    with pytest.raises(ConfigError, match=r"made with 'source' .*seq-01 \(.*now .*seq-01 \(.*--overwrite"):
+        make(make_tum(fire, 4), out, "sensor")
+    assert make(chess, out, "sensor")["frames"] == 3
+
+
 def test_a_fixed_range_colours_all_alike(tmp_path: Path) -> None:
     out = tmp_path / "out"
     make(photos(tmp_path / "in", 1), out, colour_range=(0.0, 10.0))

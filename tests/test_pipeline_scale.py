@@ -14,6 +14,8 @@ from tracking_scene import ConstantDepth
 
 from slamdepth.config import Config
 from slamdepth.depth.alignment import as_given
+from slamdepth.depth.scale import DepthScale, ScaleDomain, ScaleFit
+from slamdepth.depth.scale_file import write_scale
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.geometry import se3_exp
@@ -32,6 +34,7 @@ from slamdepth.pipeline.prediction_scale import (
     choose_prediction_scale,
 )
 from slamdepth.pipeline.scale import settle_scale
+from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.report import ScaleFacts, ScaleSource
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Keyframe, Reconstruction, Trajectory
 
@@ -337,3 +340,22 @@ def test_files_survive_the_settings_file_from_another_folder(
         kept = Config.from_dict({"scale": {"depth": given}})
         (tmp_path / "config.yaml").write_text(kept.to_yaml())
         assert Config.from_yaml(tmp_path / "config.yaml") == kept
+
+
+def test_a_file_fitted_to_another_sequence_of_the_same_name_is_not_its_own(tmp_path: Path) -> None:
+    dataset, model = MadeUpDataset(8), Network()
+    choose = choose_prediction_scale
+    scale = DepthScale(1.1, 0.0, ScaleDomain.DEPTH)
+    fit = ScaleFit(
+        scale, "made-up", "net", model.kind, model.weights, 0.01, None, 8, 100, 0.1, sequence_id(dataset)
+    )
+    own, other = tmp_path / "own.yaml", tmp_path / "other.yaml"
+    write_scale(own, fit)
+    write_scale(other, replace(fit, sequence_id=sequence_id(MadeUpDataset(9))))
+    mine = choose(dataset, model, config_of(depth=str(own)), range(8))
+    assert mine.from_ground_truth
+    assert mine.how.endswith("fitted to the depth sensor of this very sequence")
+    theirs = choose(dataset, model, config_of(depth=str(other)), range(8))
+    assert not theirs.from_ground_truth
+    assert theirs.how.endswith("fitted to the depth sensor of made-up, another sequence")
+    assert theirs.sigma_log == NETWORK_SIGMA_LOG
