@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,12 +12,11 @@ from command_line import call
 from hypothesis import given
 from hypothesis import strategies as st
 from sequences import CAMERA, depth_raw, image_rgb, make_sevenscenes, make_tum, write_image
-from tracking_scene import ConstantDepth
+from tracking_scene import register_constant_depth
 
 from slamdepth.datasets import Dataset, known_readers, open_dataset, read_camera, write_camera
 from slamdepth.datasets.readers.images import FolderSequence, ImagesReader
 from slamdepth.datasets.resizing import LONGEST_SIDE_PX, reduced_camera
-from slamdepth.depth import registry
 from slamdepth.errors import CameraError, DatasetError, InputError
 from slamdepth.geometry import rotation_angle_rad
 from slamdepth.io import read_tum_trajectory
@@ -155,10 +153,7 @@ def test_garbage_is_refused(tmp_path_factory: pytest.TempPathFactory, contents: 
 def test_a_folder_of_images_is_run_like_its_sequence(
     tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def flat(**_: Any) -> ConstantDepth:
-        return ConstantDepth()
-
-    monkeypatch.setitem(registry._factories, "constant", flat)
+    register_constant_depth(monkeypatch)
     plain = tmp_path / "images"
     plain.mkdir()
     for number, path in enumerate(sorted((tiny_room / "rgb").iterdir())):

@@ -5,18 +5,16 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from command_line import call
-from tracking_scene import ConstantDepth
+from tracking_scene import register_constant_depth
 
 from slamdepth.datasets import Dataset, open_dataset, read_camera, write_camera
 from slamdepth.datasets.readers.video import VideoSequence
 from slamdepth.datasets.video import VideoFile
-from slamdepth.depth import registry
 from slamdepth.errors import CameraError, DatasetError
 from slamdepth.geometry import rotation_angle_rad
 from slamdepth.io import read_tum_trajectory
@@ -148,10 +146,7 @@ def test_a_video_is_run_like_its_frames(
 ) -> None:
     """The trajectory of a film of the rendered room is about the one of its images."""
 
-    def flat(**_: Any) -> ConstantDepth:
-        return ConstantDepth()
-
-    monkeypatch.setitem(registry._factories, "constant", flat)
+    register_constant_depth(monkeypatch)
     images = [cv2.imread(str(path)) for path in sorted((tiny_room / "rgb").iterdir())]
     camera = read_camera(tiny_room / "camera.yaml")
     video = film(tmp_path / "room.avi", images, camera.fps)

@@ -7,12 +7,15 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from slamdepth.config import Config
 from slamdepth.datasets.synth import SynthSettings, render_frames, synth_camera
+from slamdepth.depth import registry
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.geometry import invert, umeyama
@@ -92,6 +95,15 @@ class ConstantDepth:
         return DepthPrediction(
             np.full(shape, self.depth_m, np.float32), self.kind, np.full(shape, self.sigma_log, np.float32)
         )
+
+
+def register_constant_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes :class:`ConstantDepth` known as the depth model ``constant``."""
+
+    def flat(**_: Any) -> ConstantDepth:
+        return ConstantDepth()
+
+    monkeypatch.setitem(registry._factories, "constant", flat)
 
 
 class Run:

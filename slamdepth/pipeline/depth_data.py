@@ -53,11 +53,12 @@ def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
             f"{path}: no known sequence layout and no other images with depth; known are: {known}"
         )
     datasets = [open_dataset(sequence, camera) for sequence in sequences]
-    with_depth = [dataset for dataset in datasets if dataset.has_depth]
-    for dataset in datasets if with_depth else ():
+    if not (with_depth := [dataset for dataset in datasets if dataset.has_depth]):
+        return [SequencePlace.of(datasets[0])]  # which says so
+    for dataset in datasets:
         if not dataset.has_depth:
             logger.warning("%s: left out, has no sensor depth", dataset.path)
-    return [SequencePlace.of(dataset) for dataset in with_depth or datasets]
+    return [SequencePlace.of(dataset) for dataset in with_depth]
 
 
 def _is_place(folder: Path) -> bool:

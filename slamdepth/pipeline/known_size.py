@@ -4,20 +4,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.datasets import Dataset
-from slamdepth.errors import DatasetError, ImageDecodeError
+from slamdepth.errors import DatasetError
 from slamdepth.evaluation import score_trajectory
 from slamdepth.evaluation.bootstrap import block_resamples
 from slamdepth.geometry import umeyama
 from slamdepth.mapping.floor import MAX_TILT_DEG, find_floor
 from slamdepth.report import ScaleSource
-from slamdepth.types import Keyframe, Reconstruction, Trajectory
+from slamdepth.types import Frame, Keyframe, Reconstruction, Trajectory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -116,23 +115,24 @@ def from_camera_height(
     return ScaleEstimate(ScaleSource.CAMERA_HEIGHT, height_m / floor.height, sigma_log, how)
 
 
-def from_sensor(dataset: Dataset, keyframes: Sequence[Keyframe]) -> ScaleEstimate:
+def from_sensor(keyframes: Sequence[Keyframe], frames: Iterable[Frame]) -> ScaleEstimate:
     """Compare the sensor's depth with the map's at the keypoints of every keyframe.
 
     What predictions are multiplied by is fitted to all pixels; the map is made of those that can be tracked,
     where a network errs in another way.
 
+    Args:
+        frames: those of the keyframes, with their sensor depth; some may be missing.
+
     Raises:
         DatasetError: no keyframe has both.
     """
     logs = []
-    for keyframe in keyframes:
-        try:
-            sensor_m = dataset.read(keyframe.frame.index, with_depth=True).depth_m
-        except ImageDecodeError:
+    keyframe_of = {keyframe.frame.index: keyframe for keyframe in keyframes}
+    for frame in frames:
+        if (sensor_m := frame.depth_m) is None:
             continue
-        if sensor_m is None:
-            continue
+        keyframe = keyframe_of[frame.index]
         u, v = np.rint(keyframe.keypoints_px).astype(np.int64).T
         inside = (u >= 0) & (v >= 0) & (u < sensor_m.shape[1]) & (v < sensor_m.shape[0])
         theirs, ours = sensor_m[v[inside], u[inside]], keyframe.depth_m[v[inside], u[inside]]

@@ -26,7 +26,7 @@ from slamdepth.pipeline.known_size import (
     fused,
     rescaled,
 )
-from slamdepth.pipeline.prediction_scale import PredictionScale
+from slamdepth.pipeline.prediction_scale import PredictionScale, read_with_depth
 from slamdepth.report import ScaleFacts, ScalePart, ScaleSource
 from slamdepth.types import Reconstruction
 
@@ -50,7 +50,9 @@ def settle_scale(
     measured = None
     if before.fit is not None:
         try:
-            own = measured = from_sensor(dataset, reconstruction.keyframes)
+            keyframes = reconstruction.keyframes
+            frames = read_with_depth(dataset, [k.frame.index for k in keyframes], lambda done, total: None)
+            own = measured = from_sensor(keyframes, frames)
         except DatasetError as error:
             notes.append(f"the map's own scale was not compared with the sensor: {error}")
     prediction_factor = before.scale.scale if before.scale is not None else 1.0
