@@ -22,9 +22,9 @@ from benchmarks.depth_places import DEFAULT_CONFIG, config_without
 from benchmarks.depth_rows import judged_row, table
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.depth.training.config import TrainConfig, digest
-from slamdepth.depth.training.loop import steps_per_epoch, train_depth
-from slamdepth.depth.training.progress import TrainStep
+from slamdepth.training.config import TrainConfig, digest
+from slamdepth.training.loop import steps_per_epoch, train_depth
+from slamdepth.training.progress import TrainStep
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "as shipped": {},

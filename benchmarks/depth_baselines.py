@@ -31,11 +31,11 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.depth.dinov2 import load_dinov2
 from slamdepth.depth.dinov2_mlp import Dinov2Mlp, read_header, save_mlp
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.depth.training.data import data_folder
-from slamdepth.depth.training.mlp import MlpPairs, MlpSettings, cached_tokens, read_pairs, train_mlp
-from slamdepth.depth.training.progress import Progress, TrainStep
-from slamdepth.depth.training.readers.pairs import PairPlace, PairReader
 from slamdepth.errors import WeightsError
+from slamdepth.training.data import data_folder
+from slamdepth.training.mlp import MlpPairs, MlpSettings, cached_tokens, read_pairs, train_mlp
+from slamdepth.training.progress import Progress, TrainStep
+from slamdepth.training.readers.pairs import PairPlace, PairReader
 
 TRAINED = {
     "dinov2-mlp-32": ("tokens", 32),

@@ -25,12 +25,12 @@ from benchmarks.command import errors_in_one_line
 from benchmarks.depth_rows import judged_row, mean_row, table
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.depth.training.config import TrainConfig, digest
-from slamdepth.depth.training.data import data_folder
-from slamdepth.depth.training.loop import train_depth
-from slamdepth.depth.training.progress import TrainStep
 from slamdepth.errors import ConfigError
 from slamdepth.pipeline.training_data import sequence_readers
+from slamdepth.training.config import TrainConfig, digest
+from slamdepth.training.data import data_folder
+from slamdepth.training.loop import train_depth
+from slamdepth.training.progress import TrainStep
 
 DEFAULT_CONFIG = Path(__file__).resolve().parents[1] / "slamdepth" / "depth" / "configs" / "dinov2_head.yaml"
 OVERRULED = ("members", "coarse_epochs", "fine_epochs", "batch", "learning_rate", "seed")

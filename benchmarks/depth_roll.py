@@ -31,7 +31,7 @@ from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.evaluate import judge_depth
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.depth.turning import roll_rad, turned, turned_back
+from slamdepth.depth.upright import roll_rad, turned, turned_back
 from slamdepth.errors import DatasetError
 from slamdepth.evaluation import DepthJudge, DepthJudgement
 from slamdepth.io import write_json

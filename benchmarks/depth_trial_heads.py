@@ -14,9 +14,9 @@ from slamdepth.depth.dpt import ResidualUnit
 from slamdepth.depth.head import HeadShape
 from slamdepth.depth.head_layers import FACTOR, USUAL_DEPTH_M
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
-from slamdepth.depth.training.config import LossConfig
-from slamdepth.depth.training.losses import total_loss
-from slamdepth.depth.training.mlp import mse_ssim_loss
+from slamdepth.training.config import LossConfig
+from slamdepth.training.losses import total_loss
+from slamdepth.training.mlp import mse_ssim_loss
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 """Of log depth and log spread ``(B, 2, h, w)`` and canonical depth ``(B, h, w)``, 0 unknown."""

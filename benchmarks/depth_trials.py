@@ -31,13 +31,13 @@ from benchmarks.depth_trial_heads import DptLikeHead, LinearHead, Loss, mse_ssim
 from benchmarks.markdown import markdown_table
 from benchmarks.summary import environment
 from slamdepth.depth.head import DepthHead, HeadShape
-from slamdepth.depth.training.caches import Encoder, fill_cache, open_encoder, plan_caches
-from slamdepth.depth.training.config import TrainConfig, digest
-from slamdepth.depth.training.features import FeatureCache, load_batch, load_mixed_batch
-from slamdepth.depth.training.loop import head_shape, learning_rate
-from slamdepth.depth.training.losses import taught, total_loss
-from slamdepth.depth.training.stages import coarse_target, not_always_told, predict
 from slamdepth.io import write_json
+from slamdepth.training.caches import Encoder, fill_cache, open_encoder, plan_caches
+from slamdepth.training.config import TrainConfig, digest
+from slamdepth.training.features import FeatureCache, load_batch, load_mixed_batch
+from slamdepth.training.loop import head_shape, learning_rate
+from slamdepth.training.losses import taught, total_loss
+from slamdepth.training.stages import coarse_target, not_always_told, predict
 
 _GROUPS = 3
 _FEWEST_CELLS = 40

@@ -30,7 +30,7 @@ from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.io import write_json
 from slamdepth.pipeline.run import seed_everything, seed_torch
-from slamdepth.tracker import Tracker
+from slamdepth.tracking import Tracker
 
 FORMAT = 1
 _MIB = 2**20
@@ -43,7 +43,7 @@ class Sample:
 
     Attributes:
         resident: memory of the process.
-        images, features, points, seen: arrays in memory; see ``slamdepth.tracker.held.HeldBytes``.
+        images, features, points, seen: arrays in memory; see ``slamdepth.tracking.held.HeldBytes``.
         on_disk: in the temporary file.
     """
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.backend.vocabulary_training import k_majority
+from data_scripts.train_vocabulary import k_majority
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import write_text
 

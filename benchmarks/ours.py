@@ -9,7 +9,7 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.pipeline.results import keyframe_trajectory
 from slamdepth.pipeline.run import seed_everything, seed_torch
-from slamdepth.tracker import create_tracker
+from slamdepth.tracking import create_tracker
 from slamdepth.types import Camera, Frame
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +13,7 @@ from slamdepth.frontend.clouds import depth_to_cloud
 from slamdepth.geometry import orthonormalised
 from slamdepth.open3d_loader import import_open3d
 from slamdepth.types import Camera, Frame, Trajectory
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+from slamdepth.typing import Floats
 
 MAX_DEPTH_M = 5.0
 _ITERATIONS = (20, 10, 5)  # from the coarsest level
@@ -29,9 +25,9 @@ class _Odometry:
 
     def __init__(self) -> None:
         self._times: list[float] = []
-        self._poses: list[Array] = []
+        self._poses: list[Floats] = []
 
-    def _add(self, frame: Frame, T_world_camera: Array) -> None:
+    def _add(self, frame: Frame, T_world_camera: Floats) -> None:
         self._times.append(frame.timestamp_s)
         self._poses.append(orthonormalised(T_world_camera))
 
@@ -70,7 +66,7 @@ class Open3dOdometry(_Odometry):
         criterion = self._o3d.t.pipelines.odometry.OdometryConvergenceCriteria
         self._criteria = [criterion(count) for count in _ITERATIONS]
         self._last: Any = None
-        self._velocity: Array = np.eye(4)  # T_last_now
+        self._velocity: Floats = np.eye(4)  # T_last_now
 
     def step(self, frame: Frame) -> None:
         if frame.depth_m is None:
@@ -87,7 +83,7 @@ class Open3dOdometry(_Odometry):
         self._last = image
         self._add(frame, self._poses[-1] @ T_last_now)
 
-    def _register(self, image: Any) -> Array | None:
+    def _register(self, image: Any) -> Floats | None:
         try:
             result = self._o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(
                 image,

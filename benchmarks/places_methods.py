@@ -12,21 +12,21 @@ import cv2
 import numpy as np
 
 from benchmarks.places_scores import Answers
-from slamdepth.backend.places import PlaceRecogniser
 from slamdepth.config import Config
 from slamdepth.depth.alignment import log_depth_at
 from slamdepth.frontend.features import Features, create_extractor
 from slamdepth.geometry import backproject, invert, transform
+from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
-from slamdepth.tracker.local_mapper import ray_covariance
-from slamdepth.tracker.localiser import Localiser
-from slamdepth.tracker.loop_closer import LoopCloser
+from slamdepth.tracking.local_mapper import ray_covariance
+from slamdepth.tracking.localiser import Localiser
+from slamdepth.tracking.loop_closer import LoopCloser
 from slamdepth.types import Camera, DepthPrediction, Frame
+from slamdepth.typing import Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float32]
 
 TAPS = (8, 11)
 RERANKED = 10
@@ -47,8 +47,8 @@ class Place:
     features: Features
     depth: DepthPrediction
     T_world_camera: NDArray[np.float64]
-    patches: tuple[Floats, ...] = ()
-    classes: tuple[Floats, ...] = ()
+    patches: tuple[Floats32, ...] = ()
+    classes: tuple[Floats32, ...] = ()
 
 
 Answer = Callable[[int, Sequence[int]], Answers]
@@ -81,7 +81,7 @@ def bag_of_words(places: Sequence[Place], *, top_k: int | None = None) -> Answer
     return answer
 
 
-def vectors(descriptors: Sequence[Floats]) -> Answer:
+def vectors(descriptors: Sequence[Floats32]) -> Answer:
     """Cosine of one vector an image."""
     table = np.stack([d / np.linalg.norm(d) for d in descriptors])
 
@@ -116,7 +116,7 @@ def reranked(places: Sequence[Place], tap: int, first: Answer, *, with_bag: bool
     return answer
 
 
-def mutual_share(a: Floats, b: Floats) -> float:
+def mutual_share(a: Floats32, b: Floats32) -> float:
     """Share of the patches ``(P, D)`` of unit length that are each other's nearest, and near."""
     table = a @ b.T
     best, back = table.argmax(axis=1), table.argmax(axis=0)

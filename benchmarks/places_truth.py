@@ -10,11 +10,11 @@ import numpy as np
 
 from slamdepth.geometry import backproject, invert, project, transform
 from slamdepth.types import Camera
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
 
 SAME, DIFFERENT = 0.3, 0.05
 """Overlap from which two frames show one place, and below which they show two."""

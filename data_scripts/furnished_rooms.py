@@ -17,11 +17,11 @@ from furniture_models import Material, Mesh, Piece, joined, load_mesh
 from mesh_render import MeshScene
 from training_rooms import THINGS, UP, any_paint, block, colour, grey, timber, workplace
 
-from slamdepth.datasets import synth_paint as paint
-from slamdepth.datasets import synth_print as printed
-from slamdepth.datasets.synth_scene import Lamp
-from slamdepth.datasets.synth_shapes import Paint, Surface, quad
 from slamdepth.geometry import so3_exp
+from slamdepth.synth import paint as paint
+from slamdepth.synth import prints as printed
+from slamdepth.synth.scene import Lamp
+from slamdepth.synth.shapes import Paint, Surface, quad
 
 _TEXEL_M = 0.004
 _LARGEST_TEXELS = 512

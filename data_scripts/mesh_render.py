@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from furniture_models import Mesh
 
-from slamdepth.datasets.synth_light import cast_distance, occluded
-from slamdepth.datasets.synth_scene import Lamp
 from slamdepth.open3d_loader import import_open3d
+from slamdepth.synth.light import cast_distance, occluded
+from slamdepth.synth.scene import Lamp
 from slamdepth.types import Camera
 
 _LAMP_SAMPLES = 4

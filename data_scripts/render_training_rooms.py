@@ -32,9 +32,9 @@ from furniture_models import Mesh, Piece, read_catalogues
 from mesh_render import MeshRenderer
 from training_rooms import UP, plain_scene, varied_scene
 
-from slamdepth.datasets.synth_render import Renderer
 from slamdepth.geometry import so3_exp
 from slamdepth.io import write_text
+from slamdepth.synth.render import Renderer
 from slamdepth.types import Camera
 
 WIDTH, HEIGHT = 336, 252

@@ -13,12 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamdepth.datasets import synth_furniture as furniture
-from slamdepth.datasets import synth_paint as paint
-from slamdepth.datasets import synth_print as printed
-from slamdepth.datasets import synth_scene
-from slamdepth.datasets.synth_shapes import Paint, Surface, box, cylinder, ellipsoid, lathe
 from slamdepth.geometry import so3_exp
+from slamdepth.synth import furniture as furniture
+from slamdepth.synth import paint as paint
+from slamdepth.synth import prints as printed
+from slamdepth.synth import scene as synth_scene
+from slamdepth.synth.shapes import Paint, Surface, box, cylinder, ellipsoid, lathe
 
 UP = np.array([0.0, 0.0, 1.0])
 _GROUPS = ("desk", "bookshelf", "sofa", "cabinet", "rug_and_table", "plant", "corners")

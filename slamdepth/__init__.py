@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     )
     from slamdepth.evaluation import score_trajectory
     from slamdepth.io import read_tum_trajectory, write_tum_trajectory
-    from slamdepth.tracker import Tracker, create_tracker
+    from slamdepth.tracking import Tracker, create_tracker
     from slamdepth.types import (
         Camera,
         DepthKind,
@@ -61,14 +61,14 @@ _HOME = {
     "Reconstruction": "slamdepth.types",
     "SlamdepthError": "slamdepth.errors",
     "StepResult": "slamdepth.types",
-    "Tracker": "slamdepth.tracker",
+    "Tracker": "slamdepth.tracking",
     "TrackingError": "slamdepth.errors",
     "TrackingStatus": "slamdepth.types",
     "Trajectory": "slamdepth.types",
     "WeightsError": "slamdepth.errors",
     "WeightsInfo": "slamdepth.types",
     "create_depth_model": "slamdepth.depth.registry",
-    "create_tracker": "slamdepth.tracker",
+    "create_tracker": "slamdepth.tracking",
     "open_dataset": "slamdepth.datasets",
     "read_tum_trajectory": "slamdepth.io",
     "score_trajectory": "slamdepth.evaluation",

@@ -8,19 +8,14 @@ adapter to GTSAM (rotation first) lives in ``slamdepth.backend``.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slamdepth.types import Camera
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+from slamdepth.typing import Floats
 
 
-def invert(T: Array) -> Array:
+def invert(T: Floats) -> Floats:
     """Inverse of rigid transforms ``(..., 4, 4)``."""
     R = T[..., :3, :3]
     inverse = np.zeros_like(T)
@@ -30,12 +25,12 @@ def invert(T: Array) -> Array:
     return inverse
 
 
-def transform(T_a_b: Array, points_b: Array) -> Array:
+def transform(T_a_b: Floats, points_b: Floats) -> Floats:
     """Points ``(N, 3)`` of frame b in frame a."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
-def skew(v: Array) -> Array:
+def skew(v: Floats) -> Floats:
     """Cross product matrices ``(..., 3, 3)`` of vectors ``(..., 3)``."""
     v = np.asarray(v, dtype=np.float64)
     out = np.zeros((*v.shape[:-1], 3, 3))
@@ -45,7 +40,7 @@ def skew(v: Array) -> Array:
     return out
 
 
-def so3_exp(omega: Array) -> Array:
+def so3_exp(omega: Floats) -> Floats:
     """Rotation matrices ``(..., 3, 3)`` of rotation vectors ``(..., 3)`` in radians (Rodrigues)."""
     omega = np.asarray(omega, dtype=np.float64)
     if omega.ndim == 1:
@@ -60,7 +55,7 @@ def so3_exp(omega: Array) -> Array:
     return np.eye(3) + a * W + b * (W @ W)
 
 
-def _so3_exp_single(x: float, y: float, z: float) -> Array:
+def _so3_exp_single(x: float, y: float, z: float) -> Floats:
     """:func:`so3_exp` of one vector, which optimisers need a dozen times a frame, in plain numbers."""
     xx, yy, zz = x * x, y * y, z * z
     theta2 = xx + yy + zz
@@ -78,7 +73,7 @@ def _so3_exp_single(x: float, y: float, z: float) -> Array:
     )
 
 
-def so3_log(R: Array) -> Array:
+def so3_log(R: Floats) -> Floats:
     """Rotation vectors ``(..., 3)`` in radians of rotation matrices ``(..., 3, 3)``.
 
     Through the quaternion, which stays accurate near zero and near half a turn.
@@ -92,7 +87,7 @@ def so3_log(R: Array) -> Array:
     return factor[..., None] * vector
 
 
-def se3_exp(xi: Array) -> Array:
+def se3_exp(xi: Floats) -> Floats:
     """Rigid transforms ``(..., 4, 4)`` of tangents ``(..., 6)``, translation first.
 
     Rotation by the exponential map, translation taken as it is: a retraction of
@@ -106,17 +101,17 @@ def se3_exp(xi: Array) -> Array:
     return T
 
 
-def se3_log(T: Array) -> Array:
+def se3_log(T: Floats) -> Floats:
     """Tangents ``(..., 6)`` of rigid transforms ``(..., 4, 4)``; the inverse of :func:`se3_exp`."""
     return np.concatenate([T[..., :3, 3], so3_log(T[..., :3, :3])], axis=-1)
 
 
-def rotation_angle_rad(R: Array) -> Array:
+def rotation_angle_rad(R: Floats) -> Floats:
     """Angles ``(...)`` in radians of rotation matrices ``(..., 3, 3)``."""
     return np.linalg.norm(so3_log(R), axis=-1)
 
 
-def orthonormalised(T: Array) -> Array:
+def orthonormalised(T: Floats) -> Floats:
     """Rigid transforms ``(..., 4, 4)`` whose rotations are exactly orthonormal again."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     det = np.linalg.det(U @ Vt)
@@ -127,7 +122,7 @@ def orthonormalised(T: Array) -> Array:
     return out
 
 
-def quat_xyzw_to_rotation(quat_xyzw: Array) -> Array:
+def quat_xyzw_to_rotation(quat_xyzw: Floats) -> Floats:
     """Rotation matrices ``(..., 3, 3)`` of quaternions ``(..., 4)`` in TUM order x y z w."""
     q = np.asarray(quat_xyzw, dtype=np.float64)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -151,7 +146,7 @@ def quat_xyzw_to_rotation(quat_xyzw: Array) -> Array:
     return R
 
 
-def rotation_to_quat_xyzw(R: Array) -> Array:
+def rotation_to_quat_xyzw(R: Floats) -> Floats:
     """Quaternions ``(..., 4)`` x y z w with w >= 0 of rotation matrices ``(..., 3, 3)``.
 
     By the largest of the four candidates (Shepperd 1978), so never by a small divisor.
@@ -179,7 +174,7 @@ def rotation_to_quat_xyzw(R: Array) -> Array:
     return quat.reshape(*R.shape[:-2], 4)
 
 
-def project(camera: Camera, points_c: Array) -> tuple[Array, Array]:
+def project(camera: Camera, points_c: Floats) -> tuple[Floats, Floats]:
     """Project points ``(N, 3)`` of the camera frame, without distortion.
 
     Returns:
@@ -193,14 +188,14 @@ def project(camera: Camera, points_c: Array) -> tuple[Array, Array]:
     return np.stack([u, v], axis=1), z
 
 
-def backproject(camera: Camera, points_px: Array, depth_m: Array) -> Array:
+def backproject(camera: Camera, points_px: Floats, depth_m: Floats) -> Floats:
     """Points ``(N, 3)`` of the camera frame from undistorted pixels ``(N, 2)`` and depths ``(N,)``."""
     x = (points_px[:, 0] - camera.cx) / camera.fx * depth_m
     y = (points_px[:, 1] - camera.cy) / camera.fy * depth_m
     return np.stack([x, y, depth_m], axis=1)
 
 
-def umeyama(source: Array, target: Array, with_scale: bool) -> tuple[float, Array, Array]:
+def umeyama(source: Floats, target: Floats, with_scale: bool) -> tuple[float, Floats, Floats]:
     """Least-squares ``target = scale * R @ source + t`` for ``(N, 3)`` points (Umeyama 1991).
 
     Returns:

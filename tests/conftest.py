@@ -26,7 +26,7 @@ def data_dir() -> Path:
 @pytest.fixture(scope="session")
 def tiny_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered sequence of 40 frames at 320x240 with exact depth and poses; not to be changed."""
-    from slamdepth.datasets.synth import SynthSettings, render_sequence
+    from slamdepth.synth.sequence import SynthSettings, render_sequence
 
     settings = SynthSettings(frames=40, width=320, height=240, seed=3)
     return render_sequence(tmp_path_factory.mktemp("tiny") / "room", settings)

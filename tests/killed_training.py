@@ -21,8 +21,8 @@ from typing import Any
 import torch
 
 from slamdepth.depth.dinov2 import DinoV2
-from slamdepth.depth.training import loop
-from slamdepth.depth.training.config import TrainConfig
+from slamdepth.training import loop
+from slamdepth.training.config import TrainConfig
 
 ROOM = str(Path(loop.__file__).parent)
 

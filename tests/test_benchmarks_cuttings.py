@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.cuttings import cuttings, in_words, main, means, parse
 from benchmarks.depth_cache import DepthCache
 from benchmarks.remembered_depth import RememberedDepth
+from benchmarks.sub_sequences import cuttings, in_words, main, means, parse
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
 
 

@@ -17,8 +17,8 @@ from benchmarks.depth_baselines import main as baselines
 from benchmarks.depth_places import DEFAULT_CONFIG, config_without, leave_one_out, places_of, unmixed
 from benchmarks.depth_rows import judged_row, mean_row, table
 from slamdepth.depth.dinov2_mlp import MlpHead
-from slamdepth.depth.training.config import TrainConfig
 from slamdepth.errors import ConfigError
+from slamdepth.training.config import TrainConfig
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 

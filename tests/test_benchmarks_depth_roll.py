@@ -12,7 +12,7 @@ import pytest
 from made_up import MadeUpDataset
 
 from benchmarks.depth_roll import judged, main, predicted_upright, true_down
-from slamdepth.depth.turning import roll_rad
+from slamdepth.depth.upright import roll_rad
 from slamdepth.geometry import se3_exp
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Trajectory
 

@@ -26,9 +26,9 @@ from benchmarks.depth_trials import (
     try_out,
 )
 from slamdepth.depth.head import DepthHead, HeadShape
-from slamdepth.depth.training.caches import Encoder, fill_cache, plan_caches
-from slamdepth.depth.training.config import LossConfig, TrainConfig
-from slamdepth.depth.training.losses import total_loss
+from slamdepth.training.caches import Encoder, fill_cache, plan_caches
+from slamdepth.training.config import LossConfig, TrainConfig
+from slamdepth.training.losses import total_loss
 
 NAMES = ("a", "b", "c", "d")
 

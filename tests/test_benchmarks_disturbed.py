@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from made_up import MadeUpDataset, pose
 
-from benchmarks.disturbances import DISTURBANCES, mirrored_truth
-from benchmarks.disturbed import main
+from benchmarks.corruptions import DISTURBANCES, mirrored_truth
+from benchmarks.robustness import main
 from slamdepth.geometry import se3_exp
 from slamdepth.types import Camera, Trajectory
 

@@ -9,8 +9,8 @@ import pytest
 from tracking_scene import CAMERA, CONFIG, ConstantDepth, colour_only, frames
 
 from slamdepth.config import Config, merge
-from slamdepth.tracker import Tracker
-from slamdepth.tracker.between_frames import BetweenFrames
+from slamdepth.tracking import Tracker
+from slamdepth.tracking.between_frames import BetweenFrames
 from slamdepth.types import DepthPrediction, Frame
 
 

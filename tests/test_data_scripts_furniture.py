@@ -18,7 +18,7 @@ from furnished_rooms import furnished_scene  # noqa: E402
 from furniture_models import Material, Mesh, load_mesh, read_catalogues  # noqa: E402
 from mesh_render import MeshRenderer, MeshScene  # noqa: E402
 
-from slamdepth.datasets.synth_scene import Lamp  # noqa: E402
+from slamdepth.synth.scene import Lamp  # noqa: E402
 from slamdepth.types import Camera  # noqa: E402
 
 # A box of 2 x 4 x 6 (y up) whose front (+z) is red, whose top is glass and whose rest has a picture.

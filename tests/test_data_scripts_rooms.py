@@ -18,8 +18,8 @@ sys.path.insert(0, str(SCRIPTS))
 from render_training_rooms import HEIGHT, WIDTH, filmed, room_views, write_gravity  # noqa: E402
 from training_rooms import plain_scene, varied_scene  # noqa: E402
 
-from slamdepth.datasets.synth_shapes import Surface  # noqa: E402
-from slamdepth.depth.training.readers.pairs import read_gravity  # noqa: E402
+from slamdepth.synth.shapes import Surface  # noqa: E402
+from slamdepth.training.readers.pairs import read_gravity  # noqa: E402
 
 SMALL = ["--rooms", "1", "--views", "3", "--first-seed", "5000"]
 

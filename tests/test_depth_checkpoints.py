@@ -34,7 +34,7 @@ from slamdepth.depth.dpt import BASE, LARGE, SMALL, DepthAnything, DptShape
 from slamdepth.depth.evaluate import judge_depth
 from slamdepth.depth.registry import create_depth_model, depth_model_names
 from slamdepth.errors import CameraError, ConfigError, TrackingError, WeightsError
-from slamdepth.tracker.checks import check_model
+from slamdepth.tracking.checks import check_model
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 TINY = DptShape(24, 4, 3, (0, 1, 2, 3), 16, (4, 6, 8, 10), grid=5)

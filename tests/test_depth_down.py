@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from slamdepth.depth.down import DownScorer, Look, find_down, token_fields
-from slamdepth.depth.turning import roll_rad
+from slamdepth.depth.gravity_direction import DownScorer, Look, find_down, token_fields
+from slamdepth.depth.upright import roll_rad
 from slamdepth.depth.vanishing import ManhattanFrame
 from slamdepth.geometry import so3_exp
 

@@ -20,17 +20,17 @@ from slamdepth.depth.gravity_field import gravity_field
 from slamdepth.depth.head import DepthHead, HeadEnsemble, HeadShape, load_head, save_head
 from slamdepth.depth.layout import pack_about
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
-from slamdepth.depth.training import gravity, loop
-from slamdepth.depth.training.augment import View, augmented_view, matching_view, plain_view
-from slamdepth.depth.training.caches import fill_cache, plan_caches
-from slamdepth.depth.training.config import AugmentConfig, HeadConfig, LossConfig, TrainConfig, ViewConfig
-from slamdepth.depth.training.data import Place, open_place
-from slamdepth.depth.training.features import load_batch, load_mixed_batch
-from slamdepth.depth.training.losses import taught, total_loss
-from slamdepth.depth.training.stages import not_always_told
-from slamdepth.depth.training.views import Partner, SampleKey, make_view
-from slamdepth.depth.turning import roll_rad
+from slamdepth.depth.upright import roll_rad
 from slamdepth.errors import ConfigError, DatasetError, WeightsError
+from slamdepth.training import gravity, loop
+from slamdepth.training.augment import View, augmented_view, matching_view, plain_view
+from slamdepth.training.caches import fill_cache, plan_caches
+from slamdepth.training.config import AugmentConfig, HeadConfig, LossConfig, TrainConfig, ViewConfig
+from slamdepth.training.data import Place, open_place
+from slamdepth.training.features import load_batch, load_mixed_batch
+from slamdepth.training.losses import taught, total_loss
+from slamdepth.training.stages import not_always_told
+from slamdepth.training.views import Partner, SampleKey, make_view
 from slamdepth.types import Camera, Frame
 
 SHAPE = HeadShape(taps=(0, 2), token_dim=24, dim=16, blocks=1, guide_dim=8, level_dim=4, gravity=True)
@@ -280,7 +280,7 @@ def test_what_is_mixed_into_a_view_shares_its_gravity(
         taken.append((float(args[5][2]), float(view.down[2])))  # type: ignore[index]
         return view
 
-    monkeypatch.setattr("slamdepth.depth.training.views.matching_view", watched)
+    monkeypatch.setattr("slamdepth.training.views.matching_view", watched)
     mixed, again = (make_view(places, key, config, 3, partners) for _ in range(2))
     np.testing.assert_array_equal(mixed.image_rgb, again.image_rgb)
     alone = make_view(places, key, config, 3)

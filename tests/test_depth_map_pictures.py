@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from slamdepth.datasets.image_files import natural_key
 from slamdepth.datasets.intrinsics import Certainty, exif_focal_35mm, intrinsics_of
-from slamdepth.datasets.pictures import natural_key
 from slamdepth.io import encode_ply, read_depth_raw, read_image_rgb, write_depth_mm, write_png
 from slamdepth.report import depth_map
 from slamdepth.report.depth_map import Scale, coloured, nice_ticks, scale_bar, side_by_side, value_range
-from slamdepth.report.pictures import NEAR_TO_FAR, UNKNOWN, rgb_of
+from slamdepth.report.keyframe_images import NEAR_TO_FAR, UNKNOWN, rgb_of
 from slamdepth.types import DepthKind
 
 METRIC, INVERSE = DepthKind.METRIC, DepthKind.AFFINE_INVERSE_DEPTH

@@ -24,9 +24,9 @@ from slamdepth.depth.head import HeadEnsemble, HeadShape
 from slamdepth.depth.mirrored import MirroredDepth
 from slamdepth.depth.model import Dinov2Depth
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.depth.training import down as training_down
-from slamdepth.depth.training import loop, out_of_fold
-from slamdepth.depth.training.config import TrainConfig
+from slamdepth.training import gravity_direction as training_down
+from slamdepth.training import loop, out_of_fold
+from slamdepth.training.config import TrainConfig
 from slamdepth.types import Camera, Frame
 
 SHAPE = HeadShape(

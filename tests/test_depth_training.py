@@ -14,15 +14,15 @@ from killed_training import tiny_backbone
 from training_places import make_place
 
 from slamdepth.depth.head import load_head
-from slamdepth.depth.training import loop
-from slamdepth.depth.training.augment import augmented_view, plain_view, turned_view
-from slamdepth.depth.training.config import AugmentConfig, TrainConfig
-from slamdepth.depth.training.data import data_folder, open_place
-from slamdepth.depth.training.losses import laplace_nll, multiscale_gradient, scale_invariant
-from slamdepth.depth.training.stages import coarse_target
-from slamdepth.depth.training.store import SampleStore
-from slamdepth.depth.training.views import plan_samples
 from slamdepth.errors import ConfigError, DatasetError
+from slamdepth.training import loop
+from slamdepth.training.augment import augmented_view, plain_view, turned_view
+from slamdepth.training.config import AugmentConfig, TrainConfig
+from slamdepth.training.data import data_folder, open_place
+from slamdepth.training.losses import laplace_nll, multiscale_gradient, scale_invariant
+from slamdepth.training.stages import coarse_target
+from slamdepth.training.store import SampleStore
+from slamdepth.training.views import plan_samples
 from slamdepth.types import Camera, Frame
 
 
@@ -298,8 +298,8 @@ def test_losses_on_known_errors() -> None:
 
 
 def test_unknown_pixels_have_no_gradient() -> None:
-    from slamdepth.depth.training.config import LossConfig
-    from slamdepth.depth.training.losses import total_loss
+    from slamdepth.training.config import LossConfig
+    from slamdepth.training.losses import total_loss
 
     prediction = torch.zeros(1, 2, 28, 28, requires_grad=True)
     target = torch.full((1, 28, 28), 2.0)

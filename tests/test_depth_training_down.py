@@ -13,17 +13,17 @@ import torch
 from killed_training import tiny_backbone
 from training_places import make_place
 
-from slamdepth.depth.down import DownEstimate
+from slamdepth.depth.gravity_direction import DownEstimate
 from slamdepth.depth.head import HeadEnsemble, HeadShape, load_head
 from slamdepth.depth.model import Dinov2Depth
-from slamdepth.depth.training import down as training_down
-from slamdepth.depth.training import loop, plan, timing
-from slamdepth.depth.training.caches import of_gravity, of_member, plan_caches
-from slamdepth.depth.training.config import TrainConfig
-from slamdepth.depth.training.down import learn_down, offered_directions
-from slamdepth.depth.training.features import FeatureCache
-from slamdepth.depth.training.progress import silent
 from slamdepth.errors import ConfigError
+from slamdepth.training import gravity_direction as training_down
+from slamdepth.training import loop, plan, timing
+from slamdepth.training.caches import of_gravity, of_member, plan_caches
+from slamdepth.training.config import TrainConfig
+from slamdepth.training.features import FeatureCache
+from slamdepth.training.gravity_direction import learn_down, offered_directions
+from slamdepth.training.progress import silent
 from slamdepth.types import Camera, Frame
 
 SHAPE = HeadShape(taps=(0,), token_dim=8, level_dim=4, gravity=True, down_dim=16)

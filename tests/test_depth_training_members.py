@@ -12,12 +12,12 @@ from killed_training import tiny_backbone
 from training_places import make_place
 
 from slamdepth.depth.head import UPSAMPLING, load_head
-from slamdepth.depth.training import loop
-from slamdepth.depth.training.caches import Encoder, plan_caches
-from slamdepth.depth.training.config import TrainConfig
-from slamdepth.depth.training.features import FeatureCache
-from slamdepth.depth.training.plan import plan_training
 from slamdepth.errors import ConfigError
+from slamdepth.training import loop
+from slamdepth.training.caches import Encoder, plan_caches
+from slamdepth.training.config import TrainConfig
+from slamdepth.training.features import FeatureCache
+from slamdepth.training.plan import plan_training
 
 
 @pytest.fixture

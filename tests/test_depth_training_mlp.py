@@ -14,8 +14,9 @@ from training_places import make_place
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2
-from slamdepth.depth.training.data import open_place
-from slamdepth.depth.training.mlp import (
+from slamdepth.evaluation.depth_maps import depth_ssim
+from slamdepth.training.data import open_place
+from slamdepth.training.mlp import (
     MlpPairs,
     MlpSettings,
     cached_tokens,
@@ -23,8 +24,7 @@ from slamdepth.depth.training.mlp import (
     shrink,
     train_mlp,
 )
-from slamdepth.depth.training.progress import TrainStep
-from slamdepth.evaluation.depth_maps import depth_ssim
+from slamdepth.training.progress import TrainStep
 
 
 def test_the_loss_is_mse_times_exp_of_one_less_ssim() -> None:

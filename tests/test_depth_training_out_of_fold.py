@@ -12,12 +12,13 @@ import torch
 from killed_training import tiny_backbone
 from training_places import make_place
 
-from slamdepth.depth.doubt import FEATURES, Doubt, features, together
 from slamdepth.depth.head import load_head
-from slamdepth.depth.training import loop, out_of_fold, timing
-from slamdepth.depth.training.caches import Encoder, plan_caches
-from slamdepth.depth.training.config import AugmentConfig, TrainConfig
-from slamdepth.depth.training.out_of_fold import (
+from slamdepth.depth.uncertainty import FEATURES, Doubt, features, together
+from slamdepth.errors import ConfigError
+from slamdepth.training import loop, out_of_fold, timing
+from slamdepth.training.caches import Encoder, plan_caches
+from slamdepth.training.config import AugmentConfig, TrainConfig
+from slamdepth.training.out_of_fold import (
     Errors,
     fit_doubt,
     plan_folds,
@@ -26,9 +27,8 @@ from slamdepth.depth.training.out_of_fold import (
     spread_of,
     surest_half,
 )
-from slamdepth.depth.training.plan import plan_training
-from slamdepth.depth.training.progress import TrainStep
-from slamdepth.errors import ConfigError
+from slamdepth.training.plan import plan_training
+from slamdepth.training.progress import TrainStep
 
 
 @pytest.fixture

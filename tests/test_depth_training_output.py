@@ -13,12 +13,12 @@ from killed_training import tiny_backbone
 from safetensors.numpy import save_file
 from training_places import tiny_settings
 
-from slamdepth.depth.training import output as training_output
-from slamdepth.depth.training.checkpoint import checkpoint_path
-from slamdepth.depth.training.config import TrainConfig
-from slamdepth.depth.training.output import check_output
 from slamdepth.errors import OutputError
 from slamdepth.pipeline.training import plan_run, run_search, run_training
+from slamdepth.training import output as training_output
+from slamdepth.training.checkpoint import checkpoint_path
+from slamdepth.training.config import TrainConfig
+from slamdepth.training.output import check_output
 
 
 @pytest.fixture

@@ -22,17 +22,17 @@ from training_places import (
     plane_frame,
 )
 
-from slamdepth.datasets.synth import SynthSettings, render_sequence
-from slamdepth.depth.training import data
-from slamdepth.depth.training.augment import plain_view, turned_view
-from slamdepth.depth.training.caches import benchmarks_seen, plan_caches
-from slamdepth.depth.training.config import TrainConfig
-from slamdepth.depth.training.data import data_folder, known_readers, open_place, register_reader
-from slamdepth.depth.training.lens import raw_pixels, turning_point
-from slamdepth.depth.training.readers.hypersim import planar_depth_m, read_distance_m
-from slamdepth.depth.training.readers.pairs import PairReader
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.pipeline.training_data import sequence_readers
+from slamdepth.synth.sequence import SynthSettings, render_sequence
+from slamdepth.training import data
+from slamdepth.training.augment import plain_view, turned_view
+from slamdepth.training.caches import benchmarks_seen, plan_caches
+from slamdepth.training.config import TrainConfig
+from slamdepth.training.data import data_folder, known_readers, open_place, register_reader
+from slamdepth.training.lens import raw_pixels, turning_point
+from slamdepth.training.readers.hypersim import planar_depth_m, read_distance_m
+from slamdepth.training.readers.pairs import PairReader
 from slamdepth.types import Camera
 
 FR1 = (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)

@@ -16,11 +16,11 @@ from killed_training import tiny_backbone
 from training_places import tiny_settings
 
 from slamdepth.depth import weights
-from slamdepth.depth.training import loop
-from slamdepth.depth.training.config import TrainConfig
-from slamdepth.depth.training.progress import TrainStep
 from slamdepth.errors import OutputError
 from slamdepth.pipeline.training import plan_run, report_folder, run_training
+from slamdepth.training import loop
+from slamdepth.training.config import TrainConfig
+from slamdepth.training.progress import TrainStep
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def test_a_damaged_checkpoint_starts_its_member_again(
 
 
 def test_a_full_disk_is_told_before(settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    from slamdepth.depth.training import store
+    from slamdepth.training import store
 
     monkeypatch.setattr(store.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1000}))
     with pytest.raises(OutputError, match=r"the features need 0\.00 GB and 0\.00 GB are free; set SLAMDEPTH"):

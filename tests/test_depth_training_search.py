@@ -11,11 +11,11 @@ import pytest
 from killed_training import tiny_backbone
 from training_places import tiny_settings
 
-from slamdepth.depth.training import search
-from slamdepth.depth.training.config import TrainConfig
-from slamdepth.depth.training.progress import TrainStep
 from slamdepth.errors import ConfigError, OutputError
 from slamdepth.pipeline.training import run_search
+from slamdepth.training import search
+from slamdepth.training.config import TrainConfig
+from slamdepth.training.progress import TrainStep
 
 RANGES = {
     "learning_rate": {"low": 1e-4, "high": 1e-2, "log": True},

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from training_places import make_place
 
-from slamdepth.depth.training.augment import View, mixed_view
-from slamdepth.depth.training.config import AugmentConfig, ViewConfig
-from slamdepth.depth.training.data import open_place
-from slamdepth.depth.training.views import Partner, SampleKey, make_view
+from slamdepth.training.augment import View, mixed_view
+from slamdepth.training.config import AugmentConfig, ViewConfig
+from slamdepth.training.data import open_place
+from slamdepth.training.views import Partner, SampleKey, make_view
 
 RED, BLUE = (200, 0, 0), (0, 0, 200)
 DEPTHS = arrays(np.float32, (6, 9), elements=st.sampled_from([0.0, 0.5, 1.0, 2.0, 4.0]))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slamdepth.depth.turning import roll_rad, turned, turned_back
+from slamdepth.depth.upright import roll_rad, turned, turned_back
 from slamdepth.types import Camera, DepthKind, DepthPrediction
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)

@@ -23,7 +23,7 @@ from slamdepth.mapping import landmarks
 from slamdepth.mapping.keyframe_store import KeyframeStore, NamelessFile, StoredFrame, StoredPrediction
 from slamdepth.mapping.packing import Numbers, pack_image, pack_measured, pack_predicted, unpack_image
 from slamdepth.pipeline.known_size import rescaled
-from slamdepth.tracker import frame_log
+from slamdepth.tracking import frame_log
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Reconstruction
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5, depth_factor=5000.0)

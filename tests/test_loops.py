@@ -16,9 +16,9 @@ from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, invert, project, rotation_angle_rad, se3_exp, so3_exp, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
-from slamdepth.tracker.localiser import Localiser, Placement
-from slamdepth.tracker.loop_closer import Correction, LoopCloser
-from slamdepth.tracker.refused_loops import RefusedLoops
+from slamdepth.tracking.localiser import Localiser, Placement
+from slamdepth.tracking.loop_closer import Correction, LoopCloser
+from slamdepth.tracking.refused_loops import RefusedLoops
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)

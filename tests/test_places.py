@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slamdepth.backend.places import PlaceRecogniser
-from slamdepth.backend.vocabulary import Vocabulary, load_vocabulary, nearest
-from slamdepth.backend.vocabulary_training import k_majority, main, train_vocabulary
+from data_scripts.train_vocabulary import k_majority, main, train_vocabulary
 from slamdepth.errors import DatasetError, OutputError, TrackingError, WeightsError
 from slamdepth.geometry import quat_xyzw_to_rotation, rotation_angle_rad
+from slamdepth.loops.places import PlaceRecogniser
+from slamdepth.loops.vocabulary import Vocabulary, load_vocabulary, nearest
 
 
 def random_descriptors(rng: np.random.Generator, count: int) -> np.ndarray:

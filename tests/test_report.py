@@ -38,7 +38,7 @@ from slamdepth.report import (
     write_report,
 )
 from slamdepth.report import plots as report_plots
-from slamdepth.report.pictures import NEAR_TO_FAR, UNKNOWN, colour_depth, keyframe_gallery
+from slamdepth.report.keyframe_images import NEAR_TO_FAR, UNKNOWN, colour_depth, keyframe_gallery
 from slamdepth.report.speed import speed_plot, stage_times
 from slamdepth.report.text import count, fixed, percent
 from slamdepth.types import (

@@ -14,10 +14,10 @@ from slamdepth.backend.resection import placed_anew
 from slamdepth.config import Config
 from slamdepth.geometry import invert, project, rotation_angle_rad, se3_exp, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
-from slamdepth.tracker import map_adjuster
-from slamdepth.tracker.map_adjuster import MapAdjuster
-from slamdepth.tracker.shutter import Shutter
-from slamdepth.tracker.side_thread import SideThread
+from slamdepth.tracking import map_adjuster
+from slamdepth.tracking.map_adjuster import MapAdjuster
+from slamdepth.tracking.shutter import Shutter
+from slamdepth.tracking.side_thread import SideThread
 from slamdepth.types import Camera, Frame
 
 CAMERA = Camera(640, 480, 520.0, 510.0, 319.0, 241.0)

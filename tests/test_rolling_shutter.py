@@ -19,10 +19,10 @@ from slamdepth.frontend.features import Features
 from slamdepth.frontend.rolling_shutter import at_middle_row, px_per_readout_s, row_phase, velocity_between
 from slamdepth.geometry import backproject, invert, project, se3_exp, so3_exp, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
-from slamdepth.tracker import create_tracker
-from slamdepth.tracker.frame_log import FrameLog
-from slamdepth.tracker.localiser import Placement
-from slamdepth.tracker.shutter import Shutter
+from slamdepth.tracking import create_tracker
+from slamdepth.tracking.frame_log import FrameLog
+from slamdepth.tracking.localiser import Placement
+from slamdepth.tracking.shutter import Shutter
 from slamdepth.types import Camera, Frame, Reconstruction
 
 PINHOLE = Camera(640, 480, 520.0, 510.0, 319.0, 241.0)

@@ -16,7 +16,7 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.evaluation import score_trajectory
 from slamdepth.geometry import invert
-from slamdepth.tracker import Tracker
+from slamdepth.tracking import Tracker
 from slamdepth.types import Frame, Reconstruction, StepResult, TrackingStatus, Trajectory
 
 pytestmark = pytest.mark.data

@@ -11,7 +11,11 @@ import pytest
 import yaml
 
 from slamdepth.datasets.registry import open_dataset
-from slamdepth.datasets.synth import (
+from slamdepth.errors import ConfigError, OutputError
+from slamdepth.geometry import backproject, invert, project, rotation_angle_rad, se3_exp, transform
+from slamdepth.synth.render import Renderer
+from slamdepth.synth.scene import ROOM_M
+from slamdepth.synth.sequence import (
     SynthSettings,
     make_renderer,
     render_frame,
@@ -20,10 +24,6 @@ from slamdepth.datasets.synth import (
     synth_camera,
     synth_trajectory,
 )
-from slamdepth.datasets.synth_render import Renderer
-from slamdepth.datasets.synth_scene import ROOM_M
-from slamdepth.errors import ConfigError, OutputError
-from slamdepth.geometry import backproject, invert, project, rotation_angle_rad, se3_exp, transform
 from slamdepth.types import Camera
 
 CLEAN = SynthSettings(frames=20, width=160, height=120, noise=0, lighting_variation=0)

@@ -27,8 +27,8 @@ from slamdepth.depth.robust_centre import robust_centre
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import CameraError, ConfigError, TrackingError
 from slamdepth.geometry import invert, rotation_angle_rad, transform
-from slamdepth.tracker import CloudTracker, Tracker, create_tracker
-from slamdepth.tracker.map_adjuster import MapAdjuster
+from slamdepth.tracking import CloudTracker, Tracker, create_tracker
+from slamdepth.tracking.map_adjuster import MapAdjuster
 from slamdepth.types import DepthKind, DepthPrediction, Frame, Reconstruction, TrackingStatus
 
 DOWN_W = np.array([0.1, 0.9, 0.3]) / np.linalg.norm([0.1, 0.9, 0.3])

@@ -21,7 +21,7 @@ from tracking_scene import (
 )
 
 from slamdepth.geometry import se3_exp
-from slamdepth.tracker.retry import Retry
+from slamdepth.tracking.retry import Retry
 from slamdepth.types import DepthPrediction, Frame, StepResult, TrackingStatus
 
 LOST, RESCUED = TrackingStatus.LOST, TrackingStatus.RESCUED

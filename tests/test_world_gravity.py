@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from slamdepth.geometry import so3_exp
-from slamdepth.tracker.depth_thread import DepthThread
-from slamdepth.tracker.world_gravity import WorldGravity
+from slamdepth.tracking.depth_thread import DepthThread
+from slamdepth.tracking.world_gravity import WorldGravity
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 DOWN_W = np.array([0.1, 0.9, 0.3]) / np.linalg.norm([0.1, 0.9, 0.3])

@@ -14,12 +14,12 @@ import pytest
 from numpy.typing import NDArray
 
 from slamdepth.config import Config
-from slamdepth.datasets.synth import SynthSettings, render_frames, synth_camera
 from slamdepth.depth import registry
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.geometry import invert, umeyama
-from slamdepth.tracker import create_tracker
+from slamdepth.synth.sequence import SynthSettings, render_frames, synth_camera
+from slamdepth.tracking import create_tracker
 from slamdepth.types import (
     DepthKind,
     DepthPrediction,

@@ -13,7 +13,7 @@ import pytest
 
 from slamdepth.datasets import write_camera
 from slamdepth.datasets.readers import sevenscenes
-from slamdepth.depth.training.readers import hypersim
+from slamdepth.training.readers import hypersim
 from slamdepth.types import Camera
 
 

@@ -22,19 +22,12 @@ compares the two.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slamdepth.backend.bundle_solver import MIN_DEPTH_M, Solver, State
 from slamdepth.types import Camera
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
-    Bools = NDArray[np.bool_]
+from slamdepth.typing import Bools, Floats, Ints
 
 CHI2_2DOF_95 = 5.991
 

@@ -16,15 +16,11 @@ import numpy as np
 
 from slamdepth.backend.point_blocks import inverse_factor, times, times_transposed, transposed_times
 from slamdepth.geometry import se3_exp
+from slamdepth.typing import Bools, Floats
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from slamdepth.backend.bundle import BundleProblem
 
-    Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
-    Bools = NDArray[np.bool_]
 
 HUBER = 1.5
 CAUCHY = 2.0

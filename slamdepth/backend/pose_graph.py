@@ -21,11 +21,11 @@ import numpy as np
 
 from slamdepth.errors import TrackingError
 from slamdepth.geometry import orthonormalised
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
 
 # Holds the fixed keyframe where it is, yet leaves the normal equations well conditioned.
 _GAUGE_SIGMA = 1e-4
@@ -49,7 +49,7 @@ class Edge:
 
     i: int
     j: int
-    T_i_j: Array
+    T_i_j: Floats
     scale_i_j: float = 1.0
     sigmas: tuple[float, float, float] = (0.01, 0.01, 0.01)
     is_loop: bool = False
@@ -70,9 +70,9 @@ class PoseGraphResult:
         iterations: Levenberg-Marquardt steps of the last solution.
     """
 
-    T_world_camera: Array
-    scales: Array
-    weights: Array
+    T_world_camera: Floats
+    scales: Floats
+    weights: Floats
     is_inlier: NDArray[np.bool_]
     error_before: float
     error_after: float
@@ -80,12 +80,12 @@ class PoseGraphResult:
 
 
 def optimise_pose_graph(
-    T_world_camera: Array,
+    T_world_camera: Floats,
     edges: Sequence[Edge],
     *,
     fixed: int = 0,
     with_scale: bool = False,
-    scales: Array | None = None,
+    scales: Floats | None = None,
 ) -> PoseGraphResult:
     """Poses (and scales) of keyframes that agree best with what was measured between them.
 
@@ -145,7 +145,7 @@ def optimise_pose_graph(
 
 def _loop_weights(
     factors: Sequence[Any], loops: Sequence[int], gauge: Any, initial: Any, with_scale: bool
-) -> Array:
+) -> Floats:
     """Weight of each loop by graduated non-convexity; the other edges are known inliers."""
     import gtsam
 
@@ -196,7 +196,7 @@ def _gauge(fixed: int, initial: Any, with_scale: bool) -> Any:
     return gtsam.PriorFactorPose3(fixed, initial.atPose3(fixed), noise)
 
 
-def _to_gtsam(T: Array, scale: float, with_scale: bool) -> Any:
+def _to_gtsam(T: Floats, scale: float, with_scale: bool) -> Any:
     import gtsam
 
     if with_scale:
@@ -204,7 +204,7 @@ def _to_gtsam(T: Array, scale: float, with_scale: bool) -> Any:
     return gtsam.Pose3(T)
 
 
-def _from_gtsam(values: Any, count: int, with_scale: bool) -> tuple[Array, Array]:
+def _from_gtsam(values: Any, count: int, with_scale: bool) -> tuple[Floats, Floats]:
     T, scales = np.tile(np.eye(4), (count, 1, 1)), np.ones(count)
     for k in range(count):
         if with_scale:
@@ -217,7 +217,7 @@ def _from_gtsam(values: Any, count: int, with_scale: bool) -> tuple[Array, Array
     return orthonormalised(T), scales
 
 
-def _checked(T_world_camera: Array, edges: Sequence[Edge], fixed: int) -> Array:
+def _checked(T_world_camera: Floats, edges: Sequence[Edge], fixed: int) -> Floats:
     """The poses as float64 with exact rotations, once poses and edges are known to be sound."""
     poses = np.asarray(T_world_camera, dtype=np.float64)
     count = len(poses)

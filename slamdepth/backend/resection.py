@@ -12,20 +12,13 @@ predicted depth, a small adjustment, next. What is better is then for the whole 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from slamdepth.backend.bundle import BundleProblem, bundle_adjust
 from slamdepth.geometry import backproject, invert, orthonormalised, rotation_angle_rad, transform
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
-    Bools = NDArray[np.bool_]
+from slamdepth.typing import Bools, Ints
 
 _LINKED = 0.4  # of the most points that two cameras share: so many and they belong together
 _LEAST = 12  # triangulated points that a camera is placed by

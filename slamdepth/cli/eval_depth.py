@@ -15,9 +15,9 @@ from slamdepth.cli.signals import Interrupted, telling_what_is_kept
 
 if TYPE_CHECKING:
     from slamdepth.depth.base import DepthModel
-    from slamdepth.depth.training.data import Place
     from slamdepth.evaluation import DepthJudgement
     from slamdepth.report.depth import SheetRow
+    from slamdepth.training.data import Place
 
 _SHEET_FRAMES = 4
 

@@ -47,7 +47,7 @@ def synth_command(
     show_log()
     from rich.progress import Progress
 
-    from slamdepth.datasets.synth import SynthSettings, render_sequence
+    from slamdepth.synth.sequence import SynthSettings, render_sequence
 
     asked = {
         "frames": frames, "fps": fps, "width": width, "height": height, "seed": seed, "texture": texture,

@@ -39,10 +39,10 @@ def train_depth_command(
     """
     show_log()
     from slamdepth.cli.train_show import plan_lines, plan_table, training_bars, trials_table
-    from slamdepth.depth.training.config import TrainConfig
-    from slamdepth.depth.training.output import check_output
     from slamdepth.pipeline.folder import writable
     from slamdepth.pipeline.training import plan_run, report_folder, run_search, run_training
+    from slamdepth.training.config import TrainConfig
+    from slamdepth.training.output import check_output
 
     settings = TrainConfig.from_yaml(config)
     writable(report_folder(check_output(settings)))

@@ -12,9 +12,9 @@ from slamdepth.cli.console import error_console
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from slamdepth.depth.training.plan import TrainingPlan
-    from slamdepth.depth.training.progress import Progress, TrainStep
-    from slamdepth.depth.training.search import SearchResult
+    from slamdepth.training.plan import TrainingPlan
+    from slamdepth.training.progress import Progress, TrainStep
+    from slamdepth.training.search import SearchResult
 
 
 @contextmanager

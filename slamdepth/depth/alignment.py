@@ -20,11 +20,11 @@ import numpy as np
 
 from slamdepth.errors import TrackingError
 from slamdepth.types import DepthKind, DepthPrediction
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
 
 DEFAULT_SIGMA_LOG = 0.25
 """Deviation of log depth assumed where a model gives none."""

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from slamdepth.depth.doubt import Doubt
-from slamdepth.depth.down import DownScorer
+from slamdepth.depth.gravity_direction import DownScorer
 from slamdepth.depth.head_layers import (
     FACTOR,
     GRAVITY_CHANNELS,
@@ -31,6 +30,7 @@ from slamdepth.depth.head_layers import (
     zeroed,
 )
 from slamdepth.depth.layout import check_layout, pack_about, unpack_about
+from slamdepth.depth.uncertainty import Doubt
 from slamdepth.errors import WeightsError
 
 UPSAMPLING = "weights."
@@ -51,7 +51,7 @@ class HeadShape:
         token_dim: width of the backbone.
         dim, blocks, guide_dim: channels and residual convolutions, see ``HeadConfig``.
         members: heads whose predictions are averaged.
-        doubt: components of the tokens read by :class:`~slamdepth.depth.doubt.Doubt`, which then
+        doubt: components of the tokens read by :class:`~slamdepth.depth.uncertainty.Doubt`, which then
             says with them how sure they are; 0 where the members alone do.
         level_dim: channels of the branch that tells a view's mean log depth apart from its relief;
             0 where one branch tells both.
@@ -154,8 +154,8 @@ class DepthHead(nn.Module):
 class HeadEnsemble(nn.Module):
     """Heads that learnt from different seeds or sources, averaged.
 
-    Sigma is their geometric mean, averaged with what a :class:`~slamdepth.depth.doubt.Doubt` says where the
-    shape has one. What they disagree on adds nothing: heads that know different things differ
+    Sigma is their geometric mean, averaged with what a :class:`~slamdepth.depth.uncertainty.Doubt`
+    says where the shape has one. What they disagree on adds nothing: heads that know different things differ
     most in the scale of a whole image, which says nothing of its pixels, and the order of pixels
     by certainty got worse with it.
 

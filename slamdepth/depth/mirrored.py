@@ -12,8 +12,7 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.depth.card import card_of
 from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind, DepthPrediction, Frame
-
-Floats = NDArray[np.float32]
+from slamdepth.typing import Floats32
 
 
 class MirroredDepth:
@@ -66,7 +65,7 @@ def mirror_image(frame: Frame, gravity: NDArray[np.float64] | None = None) -> Fr
     )
 
 
-def _mean(one: Floats, other: Floats, *, is_geometric: bool) -> Floats:
+def _mean(one: Floats32, other: Floats32, *, is_geometric: bool) -> Floats32:
     """Pixel by pixel; where metres of one are 0, unknown, the other counts alone."""
     if not is_geometric:
         return ((one + other) / 2).astype(np.float32)

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from slamdepth.depth import weights as store
 from slamdepth.depth.card import ModelCard
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
-from slamdepth.depth.down import FRAMES, DownEstimate, Look, find_down
+from slamdepth.depth.gravity_direction import FRAMES, DownEstimate, Look, find_down
 from slamdepth.depth.gravity_field import gravity_field
 from slamdepth.depth.head import HeadEnsemble, load_head
 from slamdepth.depth.preprocess import (
@@ -28,7 +28,7 @@ from slamdepth.depth.preprocess import (
     resize_rgb,
 )
 from slamdepth.depth.registry import register
-from slamdepth.depth.turning import roll_rad, turned, turned_back
+from slamdepth.depth.upright import roll_rad, turned, turned_back
 from slamdepth.depth.vanishing import find_lines, manhattan_frames
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 

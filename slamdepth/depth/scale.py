@@ -20,11 +20,11 @@ from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.evaluation.bootstrap import block_resamples
 from slamdepth.evaluation.depth_pixels import MAX_M, MIN_M, STRIDE
 from slamdepth.types import DepthKind, Frame, WeightsInfo
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
 
 _FEWEST_PIXELS = 50
 _MOST_SAMPLES = 20_000

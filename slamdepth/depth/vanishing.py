@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from slamdepth.geometry import so3_exp
 from slamdepth.types import Camera
-
-Array = NDArray[np.float64]
+from slamdepth.typing import Floats
 
 _WIDTH_PX = 340
 """Lines are looked for in an image of about this width: finer ones are texture."""
@@ -44,9 +43,9 @@ class Lines:
         weights: ``(N,)`` by length.
     """
 
-    normals: Array
-    middles: Array
-    weights: Array
+    normals: Floats
+    middles: Floats
+    weights: Floats
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -61,8 +60,8 @@ class ManhattanFrame:
         support: ``(3,)``, the share of all lines' weight that runs along each.
     """
 
-    axes: Array
-    support: Array
+    axes: Floats
+    support: Floats
 
 
 def find_lines(image_rgb: NDArray[np.uint8], camera: Camera) -> Lines:
@@ -101,7 +100,7 @@ def manhattan_frames(lines: Lines, count: int = 1) -> list[ManhattanFrame]:
     rng = np.random.default_rng(0)
     axes = _drawn(lines, rng)
     order = np.argsort(-_agreement(axes, lines)[0], kind="stable")
-    chosen: list[Array] = []
+    chosen: list[Floats] = []
     for k in order:
         if len(chosen) == count:
             break
@@ -120,7 +119,7 @@ def manhattan_frames(lines: Lines, count: int = 1) -> list[ManhattanFrame]:
     return frames
 
 
-def held_upright_down(image_rgb: NDArray[np.uint8], camera: Camera) -> Array | None:
+def held_upright_down(image_rgb: NDArray[np.uint8], camera: Camera) -> Floats | None:
     """Direction of gravity ``(3,)`` in the camera's frame, of an image that was held roughly upright.
 
     None where the lines do not tell, or none of their directions is within 45 degrees of the image's own
@@ -135,7 +134,7 @@ def held_upright_down(image_rgb: NDArray[np.uint8], camera: Camera) -> Array | N
     return down if abs(np.arctan2(down[0], down[1])) < _UPRIGHT_RAD else None
 
 
-def _drawn(lines: Lines, rng: np.random.Generator) -> Array:
+def _drawn(lines: Lines, rng: np.random.Generator) -> Floats:
     """Random frames ``(N, 3, 3)``: where two lines meet, what a third says at right angles, and the rest."""
     share = lines.weights / lines.weights.sum()
     i, j, k = (lines.normals[rng.choice(len(lines), _TRIALS, p=share)] for _ in range(3))
@@ -148,7 +147,7 @@ def _drawn(lines: Lines, rng: np.random.Generator) -> Array:
     return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
-def _agreement(axes: Array, lines: Lines) -> tuple[Array, Array]:
+def _agreement(axes: Floats, lines: Lines) -> tuple[Floats, Floats]:
     """Line weight that agrees with each frame ``(N,)``; how much each line does with each axis, 0 to 1.
 
     Most of the time goes here, so it is in single precision: that moves a direction by far less than lines
@@ -163,6 +162,6 @@ def _agreement(axes: Array, lines: Lines) -> tuple[Array, Array]:
     return along.max(axis=1) @ lines.weights.astype(np.float32), along
 
 
-def _differ(axes: Array, other: Array) -> bool:
+def _differ(axes: Floats, other: Floats) -> bool:
     """True where some axis of one frame is along none of the other."""
     return bool(np.abs(axes @ other.T).max(axis=1).min() < np.cos(_SAME_RAD))

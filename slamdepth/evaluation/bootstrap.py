@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth.typing import Floats
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 8
 """Of fewer frames no interval is given."""

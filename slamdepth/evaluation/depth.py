@@ -19,11 +19,11 @@ import numpy as np
 
 from slamdepth.evaluation.depth_pixels import MAX_M, MIN_M, STRIDE, ComparedPixels
 from slamdepth.types import DepthKind
+from slamdepth.typing import Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Pixels = NDArray[np.float32]
 
 _DELTA = 1.25
 
@@ -102,7 +102,7 @@ class DepthScorer:
             raise ValueError(f"max_samples must be positive, got {max_samples}")
         self.max_samples = max_samples
         self._compared = ComparedPixels(min_m=min_m, max_m=max_m, stride=stride)
-        self._samples: list[tuple[Pixels, Pixels]] = []
+        self._samples: list[tuple[Floats32, Floats32]] = []
         self._held = 0
         self._thinning = 1
         self._metric: list[DepthErrors] = []
@@ -153,7 +153,7 @@ class DepthScorer:
             coverage=self._compared.coverage,
         )
 
-    def _keep(self, predicted: Pixels, sensor: Pixels) -> None:
+    def _keep(self, predicted: Floats32, sensor: Floats32) -> None:
         kept = (predicted[:: self._thinning].copy(), sensor[:: self._thinning].copy())
         self._samples.append(kept)
         self._held += len(kept[0])

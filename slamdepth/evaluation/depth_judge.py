@@ -21,11 +21,11 @@ from slamdepth.evaluation.depth_fit import affine_fit, apply_affine, fits_in
 from slamdepth.evaluation.depth_maps import EdgeScore, depth_ssim, edge_score
 from slamdepth.evaluation.depth_pixels import MAX_M, MIN_M, STRIDE, ComparedPixels, FramePixels, as_depth
 from slamdepth.types import DepthKind, DepthPrediction
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
 
 WAYS = ("as_predicted", "sequence_median", "frame_median", "frame_affine")
 FIGURES = (

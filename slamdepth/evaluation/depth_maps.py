@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from slamdepth.typing import Bools
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Map = NDArray[np.floating]
-    Mask = NDArray[np.bool_]
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 _K1, _K2 = 0.01, 0.03
@@ -69,7 +70,7 @@ def ssim_map(x: Any, y: Any, weight: Any, blur: Callable[[Any], Any], data_range
     return luminance * (2 * covariance + c2) / (variance_x + variance_y + c2)
 
 
-def depth_ssim(predicted_m: Map, sensor_m: Map, known: Mask) -> float:
+def depth_ssim(predicted_m: Map, sensor_m: Map, known: Bools) -> float:
     """SSIM of two depth maps in metres, the mean over the ``known`` pixels.
 
     Windows are Gaussian, 11 x 11 with a deviation of 1.5 pixels, renormalised over their
@@ -91,7 +92,7 @@ def depth_ssim(predicted_m: Map, sensor_m: Map, known: Mask) -> float:
     return float(np.asarray(similar)[known].mean())
 
 
-def edge_score(predicted_m: Map, sensor_m: Map, known: Mask) -> EdgeScore | None:
+def edge_score(predicted_m: Map, sensor_m: Map, known: Bools) -> EdgeScore | None:
     """Compare depth discontinuities; the unit of either map does not matter.
 
     ``f1`` is after the boundary F1 of Depth Pro (Bochkovskii et al. 2024): two neighbours are
@@ -140,7 +141,7 @@ def edge_score(predicted_m: Map, sensor_m: Map, known: Mask) -> EdgeScore | None
     return EdgeScore(float(np.average(scores, weights=weights)), error_px)
 
 
-def _neighbours(known: Mask, axis: int, gap: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _neighbours(known: Bools, axis: int, gap: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Flat indices of each known pixel and of the next known one along ``axis``, up to ``gap`` on."""
     flat = np.arange(known.size).reshape(known.shape)
     turned, flat = (known, flat) if axis == 1 else (known.T, flat.T)
@@ -157,14 +158,14 @@ def _located(
     second: NDArray[np.int64],
     shape: tuple[int, ...],
     log_ratio: float,
-) -> Mask:
+) -> Bools:
     mask = np.zeros(shape, dtype=bool)
     mask.ravel()[first[jumps > log_ratio]] = True
     mask.ravel()[second[jumps < -log_ratio]] = True
     return mask
 
 
-def _mean_distance(edges: Mask, others: Mask, unit_px: float) -> float:
+def _mean_distance(edges: Bools, others: Bools, unit_px: float) -> float:
     """Mean distance from each pixel of ``edges`` to the nearest of ``others``, at most 10."""
     import cv2
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.types import DepthKind
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
     Values = NDArray[np.floating]
 
 MIN_M, MAX_M = 0.1, 10.0

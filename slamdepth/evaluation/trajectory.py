@@ -25,11 +25,11 @@ import numpy as np
 
 from slamdepth.errors import DatasetError
 from slamdepth.types import Trajectory
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
 
 MAX_DIFFERENCE_S = 0.01
 """Poses farther apart in time than this are not compared; evo's own default."""
@@ -54,8 +54,8 @@ class AbsoluteError:
     median_m: float
     max_m: float
     scale: float
-    T_truth_estimate: Array
-    errors_m: Array
+    T_truth_estimate: Floats
+    errors_m: Floats
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ class RelativeError:
     trans_rmse_m: float
     rot_rmse_deg: float
     end_indices: NDArray[np.int64]
-    trans_errors_m: Array
-    rot_errors_deg: Array
+    trans_errors_m: Floats
+    rot_errors_deg: Floats
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,9 @@ class TrajectoryScore:
     truth_poses: int
     max_difference_s: float
     path_length_m: float
-    timestamps_s: Array
-    truth_m: Array
-    estimate_m: Array
+    timestamps_s: Floats
+    truth_m: Floats
+    estimate_m: Floats
     se3: AbsoluteError
     sim3: AbsoluteError
     per_frame: RelativeError

@@ -18,12 +18,10 @@ from slamdepth.errors import TrackingError
 from slamdepth.frontend.clouds import checked_cloud
 from slamdepth.frontend.point_to_plane import PolishConfig, polish
 from slamdepth.geometry import invert, orthonormalised
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
     from scipy.spatial import cKDTree
-
-    Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class CloudOdometry:
         self._clouds = 0
         self._tree: cKDTree | None = None
 
-    def register(self, cloud_c: Array, timestamp_s: float) -> Array | None:
+    def register(self, cloud_c: Floats, timestamp_s: float) -> Floats | None:
         """Place the next cloud.
 
         Args:
@@ -99,7 +97,7 @@ class CloudOdometry:
         self._clouds += 1
         return pose.copy()
 
-    def _step(self, cloud_c: Array) -> Array:
+    def _step(self, cloud_c: Floats) -> Floats:
         """KISS-ICP's own step, with the polish between its registration and its map."""
         icp = self._icp
         source_c, for_map_c = icp.voxelize(cloud_c)
@@ -120,7 +118,7 @@ class CloudOdometry:
         icp.last_pose = pose
         return pose
 
-    def _polished(self, source_c: Array, pose: Array) -> Array:
+    def _polished(self, source_c: Floats, pose: Floats) -> Floats:
         from scipy.spatial import cKDTree
 
         if self._clouds == 0 or self.config.polish.rounds == 0:
@@ -133,7 +131,7 @@ class CloudOdometry:
         return pose
 
     @property
-    def local_map_w(self) -> Array:
+    def local_map_w(self) -> Floats:
         """Points ``(M, 3)`` of the local map in the world frame."""
         return np.array(self._icp.local_map.point_cloud()).reshape(-1, 3)
 

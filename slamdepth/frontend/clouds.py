@@ -10,11 +10,10 @@ import numpy as np
 
 from slamdepth.errors import CameraError, TrackingError
 from slamdepth.types import Camera
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
 
 
 def depth_to_cloud(
@@ -25,7 +24,7 @@ def depth_to_cloud(
     min_m: float = 0.2,
     max_m: float = 5.0,
     max_jump: float = 0.03,
-) -> Array:
+) -> Floats:
     """Points of a depth image, lens distortion undone, pixels on depth edges dropped.
 
     Args:
@@ -59,7 +58,7 @@ def depth_to_cloud(
 
 
 @lru_cache(maxsize=8)
-def _rays(camera: Camera, stride: int) -> Array:
+def _rays(camera: Camera, stride: int) -> Floats:
     """Undistorted rays ``(h, w, 3)`` with z = 1 of every ``stride``-th pixel."""
     first = stride // 2
     u, v = np.meshgrid(np.arange(first, camera.width, stride), np.arange(first, camera.height, stride))
@@ -71,7 +70,7 @@ def _rays(camera: Camera, stride: int) -> Array:
     return rays
 
 
-def checked_cloud(points: Array, name: str) -> Array:
+def checked_cloud(points: Floats, name: str) -> Floats:
     """``points`` as contiguous ``(N, 3)`` float64.
 
     Raises:

@@ -23,12 +23,10 @@ from slamdepth.errors import ConfigError, TrackingError, WeightsError
 from slamdepth.frontend.matching import PixelGrid, match_all
 from slamdepth.frontend.metric import ORB, DescriptorMetric
 from slamdepth.types import Camera, WeightsInfo
+from slamdepth.typing import Floats, Ints
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    Ints = NDArray[np.int64]
-    Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

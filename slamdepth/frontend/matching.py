@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.frontend.metric import FARTHEST, ORB, DescriptorMetric
+from slamdepth.typing import Floats, Ints
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Ints = NDArray[np.int64]
-    Floats = NDArray[np.float64]
 
 _MAX_CELLS = 256  # along a side
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from slamdepth.typing import Floats32, Ints
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Ints = NDArray[np.int64]
     Bytes = NDArray[np.uint8]
-    Floats = NDArray[np.float32]
     Descriptors = NDArray[Any]
 
 FARTHEST = 1023
@@ -99,17 +99,17 @@ class UnitL2:
     def strict_distance(self) -> int:
         return int(self.strict_l2 * _UNIT)
 
-    def empty(self) -> Floats:
+    def empty(self) -> Floats32:
         return np.zeros((0, self.size), dtype=np.float32)
 
-    def between(self, a: Floats, b: Floats) -> Ints:
+    def between(self, a: Floats32, b: Floats32) -> Ints:
         return _steps(np.einsum("ij,ij->i", a, b)).astype(np.int64)
 
-    def table(self, a: Floats, b: Floats) -> NDArray[np.uint16]:
+    def table(self, a: Floats32, b: Floats32) -> NDArray[np.uint16]:
         return _steps(a @ b.T).astype(np.uint16)
 
 
-def _steps(cosine: Floats) -> Floats:
+def _steps(cosine: Floats32) -> Floats32:
     """The distance of unit vectors by their inner product, whole steps of 2 / 1023."""
     return np.rint(np.sqrt(np.clip(2.0 - 2.0 * cosine, 0.0, 4.0)) * np.float32(_UNIT))
 

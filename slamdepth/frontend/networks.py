@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +14,7 @@ from slamdepth.errors import ConfigError, WeightsError
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.matching import best_matches
 from slamdepth.frontend.metric import FARTHEST
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Ints = NDArray[np.int64]
+from slamdepth.typing import Ints
 
 
 class LightGlue:

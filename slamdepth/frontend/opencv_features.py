@@ -11,13 +11,12 @@ import numpy as np
 from slamdepth.errors import ConfigError
 from slamdepth.frontend.features import Features, ScaleLevels, cell_edge_px, spread
 from slamdepth.frontend.metric import DescriptorMetric
-from slamdepth.frontend.orb_words import OrbWords
+from slamdepth.frontend.orb_descriptors import OrbWords
 from slamdepth.types import Camera
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
 
 
 class OpenCvExtractor:

@@ -14,12 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.geometry import orthonormalised, so3_exp, transform
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
     from scipy.spatial import cKDTree
-
-    Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -42,8 +40,8 @@ class PolishConfig:
 
 
 def polish(
-    tree: cKDTree, cloud_c: Array, T_world_camera: Array, *, reach_m: float, config: PolishConfig
-) -> tuple[Array, float]:
+    tree: cKDTree, cloud_c: Floats, T_world_camera: Floats, *, reach_m: float, config: PolishConfig
+) -> tuple[Floats, float]:
     """Move a nearly registered cloud onto the tangent planes of a map.
 
     Directions that the geometry does not hold are not moved along (Zhang, Kaess and Singh,
@@ -80,7 +78,7 @@ def polish(
 
 
 def fit_quality(
-    tree: cKDTree, cloud_w: Array, inlier_m: float, config: PolishConfig
+    tree: cKDTree, cloud_w: Floats, inlier_m: float, config: PolishConfig
 ) -> tuple[float, float, float]:
     """Fitness, rmse in metres and observability of a registered cloud ``(N, 3)`` of the world frame.
 
@@ -111,12 +109,12 @@ class _Surface:
         flatness: ``(N,)`` 1 for a perfect plane, 0 for noise, whose normal says nothing.
     """
 
-    normal: Array
-    distance_m: Array
-    flatness: Array
+    normal: Floats
+    distance_m: Floats
+    flatness: Floats
 
 
-def _surface(tree: cKDTree, points_w: Array, config: PolishConfig) -> _Surface:
+def _surface(tree: cKDTree, points_w: Floats, config: PolishConfig) -> _Surface:
     _, beside = tree.query(points_w, k=min(config.neighbours, tree.n))
     patches = np.asarray(tree.data)[beside]
     middle = patches.mean(axis=1)
@@ -127,7 +125,7 @@ def _surface(tree: cKDTree, points_w: Array, config: PolishConfig) -> _Surface:
     return _Surface(normal, np.einsum("ni,ni->n", points_w - middle, normal), flatness)
 
 
-def _matched(tree: cKDTree, points_w: Array, reach_m: float, config: PolishConfig) -> tuple[Array, float]:
+def _matched(tree: cKDTree, points_w: Floats, reach_m: float, config: PolishConfig) -> tuple[Floats, float]:
     """Some of the points that have the map within reach, and the share of all that do."""
     distance_m, _ = tree.query(points_w, distance_upper_bound=reach_m)
     matched = np.flatnonzero(np.isfinite(distance_m))
@@ -135,7 +133,7 @@ def _matched(tree: cKDTree, points_w: Array, reach_m: float, config: PolishConfi
     return points_w[matched[:: 1 + len(matched) // config.points]], share
 
 
-def _rows(points_w: Array, normals: Array) -> tuple[Array, Array, float]:
+def _rows(points_w: Floats, normals: Floats) -> tuple[Floats, Floats, float]:
     """Jacobian ``(N, 6)`` of the distances to planes; rotation about the centre, lengths in radii."""
     centre = points_w.mean(axis=0)
     arms = points_w - centre

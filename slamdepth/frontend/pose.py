@@ -16,11 +16,11 @@ import numpy as np
 
 from slamdepth.geometry import se3_exp
 from slamdepth.types import Camera
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
 
 CHI2_2DOF_95 = 5.991
 HUBER = 1.345

@@ -9,7 +9,6 @@ whether the geometry holds it in every direction.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,11 +17,7 @@ from slamdepth.frontend.cloud_odometry import CloudOdometry, CloudOdometryConfig
 from slamdepth.frontend.clouds import checked_cloud, depth_to_cloud
 from slamdepth.frontend.point_to_plane import PolishConfig, fit_quality, polish
 from slamdepth.geometry import invert, orthonormalised, rotation_angle_rad, transform
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+from slamdepth.typing import Floats
 
 __all__ = [
     "CloudOdometry",
@@ -72,7 +67,7 @@ class RegistrationResult:
         is_trusted: the verdict on all of these and the distance from the guess.
     """
 
-    T_world_camera: Array
+    T_world_camera: Floats
     fitness: float
     rmse_m: float
     observability: float
@@ -81,9 +76,9 @@ class RegistrationResult:
 
 
 def register_cloud(
-    local_map_w: Array,
-    cloud_c: Array,
-    T_world_camera_guess: Array,
+    local_map_w: Floats,
+    cloud_c: Floats,
+    T_world_camera_guess: Floats,
     config: RegistrationConfig | None = None,
 ) -> RegistrationResult:
     """Register a cloud to the points of a local map.
@@ -134,7 +129,7 @@ def register_cloud(
     return RegistrationResult(pose, fitness, rmse_m, observability, converged, is_trusted)
 
 
-def _align(map_w: Array, cloud_c: Array, guess: Array, *, voxel_m: float, reach_m: float) -> Array:
+def _align(map_w: Floats, cloud_c: Floats, guess: Floats, *, voxel_m: float, reach_m: float) -> Floats:
     """One run of KISS-ICP's point-to-point ICP; it sees no farther than the neighbouring voxels."""
     from kiss_icp.mapping import VoxelHashMap
     from kiss_icp.registration import Registration
@@ -153,7 +148,7 @@ def _align(map_w: Array, cloud_c: Array, guess: Array, *, voxel_m: float, reach_
     return orthonormalised(np.array(pose))
 
 
-def _motion(T_world_a: Array, T_world_b: Array) -> tuple[float, float]:
+def _motion(T_world_a: Floats, T_world_b: Floats) -> tuple[float, float]:
     """Distance in metres and angle in radians between two poses."""
     T_a_b = invert(T_world_a) @ T_world_b
     return float(np.linalg.norm(T_a_b[:3, 3])), float(rotation_angle_rad(T_a_b[:3, :3]))

@@ -11,17 +11,11 @@ Video Rectification and Stabilisation for Cell-Phones", IJCV 2012; here with tra
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from slamdepth.geometry import so3_log, transform
 from slamdepth.types import Camera
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
+from slamdepth.typing import Floats
 
 _NEAREST_M = 0.05
 _STEP_S = 1e-3  # of the difference quotient; the motion is linear in it but for the perspective

@@ -18,11 +18,11 @@ import numpy as np
 from slamdepth.mapping.fusion_depth import View, trusted_depth
 from slamdepth.mapping.tsdf import undistorted_depth
 from slamdepth.types import Keyframe
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
 
 MAX_TILT_DEG = 35.0
 _KNOWN_TILT_DEG = 20.0  # predicted floors lean, and gravity as images tell it errs by some degrees

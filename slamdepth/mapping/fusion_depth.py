@@ -11,11 +11,11 @@ import numpy as np
 
 from slamdepth.geometry import backproject, invert, project, transform
 from slamdepth.types import Camera, Keyframe
+from slamdepth.typing import Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Depth = NDArray[np.float32]
 
 _JUMP = 0.07
 """Relative depth step between direct neighbours that marks both as flying pixels: on a surface
@@ -30,7 +30,7 @@ _MIN_OVERLAP = 0.35
 _MAX_NEIGHBOURS = 8
 
 
-def trusted_depth(keyframe: Keyframe, max_depth_m: float) -> Depth:
+def trusted_depth(keyframe: Keyframe, max_depth_m: float) -> Floats32:
     """Depth ``(H, W)`` in the raw pixels of ``keyframe`` with what cannot be trusted set to 0.
 
     Dropped are depths beyond ``max_depth_m``, flying pixels at depth jumps and, of
@@ -51,7 +51,7 @@ def trusted_depth(keyframe: Keyframe, max_depth_m: float) -> Depth:
     return depth
 
 
-def _at_jumps(depth: Depth) -> NDArray[np.bool_]:
+def _at_jumps(depth: Floats32) -> NDArray[np.bool_]:
     jump = np.zeros(depth.shape, bool)
     for a, b in (
         ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
@@ -75,11 +75,11 @@ class View:
     """
 
     camera: Camera
-    depth_m: Depth
+    depth_m: Floats32
     T_world_camera: NDArray[np.float64]
 
     @classmethod
-    def of(cls, depth_m: Depth, camera: Camera, T_world_camera: NDArray[np.float64]) -> View:
+    def of(cls, depth_m: Floats32, camera: Camera, T_world_camera: NDArray[np.float64]) -> View:
         """Thin out undistorted depth ``(H, W)`` by nearest pixels."""
         step = max(1, camera.width // _VIEW_WIDTH_PX)
         thin = np.ascontiguousarray(depth_m[step // 2 :: step, step // 2 :: step])

@@ -15,13 +15,10 @@ import numpy as np
 
 from slamdepth.geometry import invert, transform
 from slamdepth.types import DepthPrediction, Frame
+from slamdepth.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
-    Bools = NDArray[np.bool_]
 
 
 @dataclass

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.open3d_loader import import_open3d
+from slamdepth.typing import Floats, Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from slamdepth.mapping.mesh import TriangleMesh
     from slamdepth.types import Camera
 
-    Floats = NDArray[np.float64]
-    Colours = NDArray[np.float32]
 
 _FLAT = 0.75  # share of the light that comes from everywhere; photographs have shades of their own
 _GREY, _GREY_FLAT = 0.85, 0.25
@@ -84,12 +83,12 @@ def _directions(camera: Camera, R_world_camera: Floats, dx: float, dy: float) ->
 
 
 def _lit(
-    colors: Colours | None,
+    colors: Floats32 | None,
     corners: NDArray[np.int32],
     uv: NDArray[np.float32],
     normals: NDArray[np.float32],
     directions: NDArray[np.float32],
-) -> Colours:
+) -> Floats32:
     """Colours ``(N, 3)`` of hits between the ``corners (N, 3)`` of their triangles."""
     length = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
     cosine = np.abs(np.einsum("ij,ij->i", normals, directions)) / length

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from slamdepth.datasets import open_dataset
-from slamdepth.depth.training.data import Place, data_folder, known_readers, open_place
 from slamdepth.errors import DatasetError
 from slamdepth.pipeline.training_data import SequencePlace, sequence_readers
+from slamdepth.training.data import Place, data_folder, known_readers, open_place
 from slamdepth.types import Frame
 
 logger = logging.getLogger(__name__)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,11 +16,7 @@ from slamdepth.geometry import umeyama
 from slamdepth.mapping.floor import MAX_TILT_DEG, find_floor
 from slamdepth.report import ScaleSource
 from slamdepth.types import Frame, Keyframe, Reconstruction, Trajectory
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
+from slamdepth.typing import Floats
 
 HEIGHT_SIGMA_LOG = 0.03
 """How well a camera's height over a floor is known to people, and a floor is level."""

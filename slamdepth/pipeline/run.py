@@ -135,7 +135,7 @@ def run(
 
 
 def _make_tracker(dataset: Dataset, model: DepthModel, config: Config) -> Any:
-    from slamdepth.tracker import create_tracker
+    from slamdepth.tracking import create_tracker
 
     return create_tracker(dataset.camera, depth_model=model, config=config)
 

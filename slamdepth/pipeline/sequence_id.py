@@ -7,7 +7,7 @@ import numpy as np
 
 from slamdepth.datasets import Dataset
 from slamdepth.datasets.sequence import ImageSequence, is_file
-from slamdepth.depth.training.data import fingerprint
+from slamdepth.training.data import fingerprint
 
 
 def sequence_id(dataset: Dataset) -> str:

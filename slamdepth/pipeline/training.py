@@ -6,15 +6,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slamdepth.depth.training.config import TrainConfig
-from slamdepth.depth.training.progress import Progress, silent
 from slamdepth.pipeline.training_data import sequence_readers
+from slamdepth.training.config import TrainConfig
+from slamdepth.training.progress import Progress, silent
 
 if TYPE_CHECKING:
     from slamdepth.depth.dinov2 import DinoV2
-    from slamdepth.depth.training.plan import TrainingPlan
-    from slamdepth.depth.training.results import TrainResult
-    from slamdepth.depth.training.search import SearchResult
+    from slamdepth.training.plan import TrainingPlan
+    from slamdepth.training.results import TrainResult
+    from slamdepth.training.search import SearchResult
 
 
 def report_folder(output: Path) -> Path:
@@ -27,10 +27,10 @@ def run_training(
 ) -> TrainResult:
     """Train the head of ``config`` and write :func:`report_folder` beside it.
 
-    Arguments and errors are those of :func:`slamdepth.depth.training.loop.train_depth`.
+    Arguments and errors are those of :func:`slamdepth.training.loop.train_depth`.
     """
-    from slamdepth.depth.training.loop import train_depth
     from slamdepth.report.training import write_training_report
+    from slamdepth.training.loop import train_depth
 
     settings = config.model_dump(mode="json")
     return train_depth(
@@ -44,8 +44,8 @@ def run_training(
 
 
 def plan_run(config: TrainConfig, *, device: str = "cpu", backbone: DinoV2 | None = None) -> TrainingPlan:
-    """What :func:`run_training` would take; errors of :func:`slamdepth.depth.training.plan.plan_training`."""
-    from slamdepth.depth.training.plan import plan_training
+    """What :func:`run_training` would take; errors of :func:`slamdepth.training.plan.plan_training`."""
+    from slamdepth.training.plan import plan_training
 
     return plan_training(config, device=device, backbone=backbone, readers=sequence_readers())
 
@@ -58,8 +58,8 @@ def run_search(
     progress: Progress = silent,
     backbone: DinoV2 | None = None,
 ) -> SearchResult:
-    """Tune ``config``; see :func:`slamdepth.depth.training.search.search_settings`."""
-    from slamdepth.depth.training.search import search_settings
+    """Tune ``config``; see :func:`slamdepth.training.search.search_settings`."""
+    from slamdepth.training.search import search_settings
 
     return search_settings(
         config, trials, device=device, progress=progress, backbone=backbone, readers=sequence_readers()

@@ -14,9 +14,9 @@ import numpy as np
 
 from slamdepth.datasets import Dataset, Reader, known_readers
 from slamdepth.datasets.sequence import ImageSequence, is_file
-from slamdepth.datasets.synth import SETTINGS_FILE
-from slamdepth.depth.training.data import PlaceReader, fingerprint
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
+from slamdepth.synth.sequence import SETTINGS_FILE
+from slamdepth.training.data import PlaceReader, fingerprint
 from slamdepth.types import Camera, Frame
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class SequencePlace:
         return fingerprint((), str(self.dataset.path), times, self.camera, self.frames)
 
     def read(self, index: int) -> Frame:
-        """Frame ``index`` of those with depth; see :meth:`slamdepth.depth.training.data.Place.read`."""
+        """Frame ``index`` of those with depth; see :meth:`slamdepth.training.data.Place.read`."""
         try:
             frame = self.dataset.read(self.frames[index], with_depth=True)
         except (ImageDecodeError, CameraError) as error:

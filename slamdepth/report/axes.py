@@ -4,14 +4,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+from slamdepth.typing import Floats
 
 _LEAST_LEVEL = 0.2  # sine of the angle to gravity below which a direction is no way forward
 
@@ -26,16 +22,16 @@ class View:
     """
 
     title: str
-    across: Array
-    up: Array
+    across: Floats
+    up: Floats
     labels: tuple[str, str]
 
-    def flat(self, points: Array) -> Array:
+    def flat(self, points: Floats) -> Floats:
         """``points (N, 3)`` of the world as ``(N, 2)`` metres to the right and upwards."""
         return np.asarray(points @ np.stack([self.across, self.up], axis=1))
 
 
-def drawing_views(down_w: Array | None) -> tuple[View, View]:
+def drawing_views(down_w: Floats | None) -> tuple[View, View]:
     """Two views of the world frame, whose own axes are the first camera's (x right, y down, z forward).
 
     Args:
@@ -55,7 +51,7 @@ def drawing_views(down_w: Array | None) -> tuple[View, View]:
     )
 
 
-def about_views(down_w: Array | None) -> str:
+def about_views(down_w: Floats | None) -> str:
     """A sentence for the caption of pictures by :func:`drawing_views`."""
     if down_w is None:
         return (
@@ -68,7 +64,7 @@ def about_views(down_w: Array | None) -> str:
     )
 
 
-def level_axes(down_w: Array) -> Array:
+def level_axes(down_w: Floats) -> Floats:
     """``R_level_world (3, 3)``: rows are right, down and forward in the world frame.
 
     Forward is where the first camera looked, made level; where it looked straight down or up, where it

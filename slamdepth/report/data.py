@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from slamdepth.config import Config
 from slamdepth.evaluation import DepthScore, TrajectoryScore
-from slamdepth.report.mesh_pictures import MeshPicture
+from slamdepth.report.mesh_images import MeshPicture
 from slamdepth.report.scale import ScaleFacts
 from slamdepth.types import Reconstruction, StepResult, WeightsInfo
 

@@ -15,8 +15,8 @@ import numpy as np
 from slamdepth.evaluation.depth_statistics import DepthStatistics
 from slamdepth.io import replacing, write_text
 from slamdepth.report.figure import new_figure, to_png
+from slamdepth.report.keyframe_images import near_to_far
 from slamdepth.report.markup import section, table
-from slamdepth.report.pictures import near_to_far
 from slamdepth.report.text import MISSING, count, fixed, percent
 from slamdepth.types import Camera
 

@@ -15,7 +15,7 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.depth.card import card_of
 from slamdepth.evaluation import DepthJudgement, Interval
 from slamdepth.report.figure import new_figure, write_png
-from slamdepth.report.pictures import UNKNOWN, near_to_far
+from slamdepth.report.keyframe_images import UNKNOWN, near_to_far
 from slamdepth.report.text import MISSING, percent
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slamdepth.report.pictures import UNKNOWN, colour_depth, rgb_of
+from slamdepth.report.keyframe_images import UNKNOWN, colour_depth, rgb_of
 from slamdepth.types import DepthKind
 
 if TYPE_CHECKING:

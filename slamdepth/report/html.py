@@ -10,8 +10,8 @@ from typing import Any
 from slamdepth.report import plots
 from slamdepth.report.axes import about_views
 from slamdepth.report.data import ReportData
+from slamdepth.report.keyframe_images import NEAR_TO_FAR, UNKNOWN, Gallery, jpeg_address, keyframe_gallery
 from slamdepth.report.markup import collapsed, plot, section, settings_table, table, tile
-from slamdepth.report.pictures import NEAR_TO_FAR, UNKNOWN, Gallery, jpeg_address, keyframe_gallery
 from slamdepth.report.speed import speed_caption, speed_plot, stage_times
 from slamdepth.report.text import MISSING, count, fixed, percent
 

@@ -12,6 +12,7 @@ from slamdepth.report import figure as fig
 from slamdepth.report.axes import drawing_views
 from slamdepth.report.gaps import gap_ends
 from slamdepth.types import TrackingStatus
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from slamdepth.report.axes import View
     from slamdepth.types import Keyframe, Reconstruction, StepResult
 
-    Array = NDArray[np.float64]
 
 _WIDTH = 9.6
 _MAX_MAP_POINTS = 20_000
@@ -42,7 +42,7 @@ def trajectory_plot(run: Reconstruction, score: TrajectoryScore | None) -> str |
         return None
     path = run.trajectory.T_world_camera[:, :3, 3]
     lines = [(_with_gaps(run.trajectory.timestamps_s, path), fig.ESTIMATE, "-", "estimate")]
-    links: Array | None = None
+    links: Floats | None = None
     if score is not None:
         T_estimate_truth = invert(score.se3.T_truth_estimate)
         truth = transform(T_estimate_truth, score.truth_m)
@@ -204,12 +204,12 @@ def scale_plot(keyframes: tuple[Keyframe, ...]) -> str | None:
         return fig.to_svg(figure, "Factor applied to the predicted depth of each keyframe")
 
 
-def _with_gaps(times: Array, values: Array) -> Array:
+def _with_gaps(times: Floats, values: Floats) -> Floats:
     """Rows ``values (N, D)`` with a row of NaN in each pause, so that no line bridges lost frames."""
     return np.insert(values.astype(np.float64), gap_ends(times), np.nan, axis=0)
 
 
-def _gap_times(times: Array, start_s: float | None = None) -> Array:
+def _gap_times(times: Floats, start_s: float | None = None) -> Floats:
     """Seconds since ``start_s`` that belong to the rows of :func:`_with_gaps`."""
     seconds = times - (times[0] if start_s is None else start_s)
     return np.insert(seconds, gap_ends(times), np.nan)
@@ -221,7 +221,7 @@ def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(changes[::2], changes[1::2], strict=True)]
 
 
-def _frame(panel: Any, view: View, points: Array) -> None:
+def _frame(panel: Any, view: View, points: Floats) -> None:
     """Titles, equal scales, and limits a little wider than the ``(N, 2)`` points."""
     from matplotlib.ticker import MaxNLocator
 

@@ -13,10 +13,10 @@ from slamdepth.errors import OutputError
 from slamdepth.io import write_json, write_text
 from slamdepth.report.environment import hardware, versions
 from slamdepth.report.figure import new_figure, write_png
-from slamdepth.report.pictures import colour_depth, near_to_far
+from slamdepth.report.keyframe_images import colour_depth, near_to_far
 
 if TYPE_CHECKING:
-    from slamdepth.depth.training.results import SampleView, TrainResult
+    from slamdepth.training.results import SampleView, TrainResult
 
 _COLOURS = ("#17458f", "#c8502b", "#2f9e4f", "#8a4fb0", "#b58a00", "#11787f")
 _README = """What a training of a depth head left here.

@@ -10,13 +10,13 @@ import numpy as np
 
 from slamdepth.report.axes import level_axes
 from slamdepth.types import Camera
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from slamdepth.mapping.mesh import TriangleMesh
 
-    Floats = NDArray[np.float64]
 
 _ELEVATION = math.radians(35.0)
 _AZIMUTHS = 36

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera, what_to_write
-from slamdepth.datasets.pictures import has_images, list_images
+from slamdepth.datasets.image_files import has_images, list_images
 from slamdepth.datasets.registry import register_last_reader
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
 from slamdepth.datasets.sequence import ImageSequence, check_size, first_image

@@ -15,7 +15,7 @@ import numpy as np
 
 from slamdepth.datasets.association import associate
 from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera, what_to_write
-from slamdepth.datasets.pictures import has_images
+from slamdepth.datasets.image_files import has_images
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import (
     MAX_TIME_DIFFERENCE_S,

@@ -15,13 +15,13 @@ from slamdepth.frontend.features import Features, ScaleLevels, cell_edge_px, reg
 from slamdepth.frontend.metric import UnitL2
 from slamdepth.frontend.networks import LightGlue, clear_errors, network_class
 from slamdepth.frontend.opencv_features import pixels, responses
-from slamdepth.frontend.orb_words import OrbWords
+from slamdepth.frontend.orb_descriptors import OrbWords
 from slamdepth.types import Camera
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
 
 _METRIC = UnitL2(128, max_l2=0.8, strict_l2=0.7)
 _MIN_SCORE = 0.2  # the authors' own

@@ -38,7 +38,6 @@ from slamdepth.pipeline.depth_maps.about import (
     readme_text,
 )
 from slamdepth.pipeline.depth_maps.drawing import common_range, frame_scale, write_cloud
-from slamdepth.pipeline.depth_maps.film import film_writer
 from slamdepth.pipeline.depth_maps.folder import CLOUD, COLOUR, MILLIMETRES, VALUES, VIDEO, DepthFolder
 from slamdepth.pipeline.depth_maps.options import (
     DepthMapOptions,
@@ -47,6 +46,7 @@ from slamdepth.pipeline.depth_maps.options import (
     Progress,
 )
 from slamdepth.pipeline.depth_maps.sources import Shot, Source, SourceKind, open_source
+from slamdepth.pipeline.depth_maps.video import film_writer
 from slamdepth.report.depth_map import Scale, depth_map_picture, known_pixels, side_by_side, value_range
 from slamdepth.types import DepthKind
 

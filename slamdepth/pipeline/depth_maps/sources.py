@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from slamdepth.datasets import Dataset, known_readers, open_dataset
+from slamdepth.datasets.image_files import IMAGE_ENDINGS, list_images, read_picture, short_names
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics, find_camera_file, intrinsics_of
-from slamdepth.datasets.pictures import IMAGE_ENDINGS, list_images, read_picture, short_names
 from slamdepth.datasets.sequence import check_size
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
-from slamdepth.depth.training.data import fingerprint
-from slamdepth.depth.training.readers.pairs import PairPlace, PairReader
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.pipeline.sequence_id import sequence_id
+from slamdepth.training.data import fingerprint
+from slamdepth.training.readers.pairs import PairPlace, PairReader
 from slamdepth.types import Camera, Frame
 
 if TYPE_CHECKING:

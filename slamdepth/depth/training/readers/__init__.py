@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Readers of training data, one file each; see :mod:`slamdepth.depth.training.data`."""

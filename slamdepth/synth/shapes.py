@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Textured surfaces of the synthetic room: grids of points with a paint.
+
+Every shape is a list of :class:`Surface`; a surface is a grid of points ``(rows,
+columns, 3)`` in the world (z up, metres), seen from the side its normals point to, with
+the row axis running down its texture. Each owns a rectangle of the texture atlas.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.typing import Floats
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+Paint = Callable[[np.random.Generator, int, int, float], "NDArray[np.float32]"]
+"""``paint(rng, height, width, texel_m) -> (height, width, 3)`` float32 sRGB 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One painted patch.
+
+    Attributes:
+        points: ``(rows, columns, 3)`` metres.
+        size_m: length along a row and down a column.
+        paint: makes its texture.
+        emission: above 0, the patch glows: its texture times this, unlit.
+        texel_scale: coarser texels where little is to be seen (a ceiling).
+    """
+
+    points: Floats
+    size_m: tuple[float, float]
+    paint: Paint
+    emission: float = 0.0
+    texel_scale: float = 1.0
+
+    @property
+    def normals(self) -> Floats:
+        """``(rows, columns, 3)`` unit normals at the grid points, towards the visible side."""
+        along = np.gradient(self.points, axis=1)
+        down = np.gradient(self.points, axis=0)
+        normal = np.cross(down, along)
+        length = np.linalg.norm(normal, axis=2, keepdims=True)
+        mean = normal.sum(axis=(0, 1))
+        # The poles of a sphere have no normal of their own: take the radial direction's stand-in.
+        flat = np.broadcast_to(mean / max(float(np.linalg.norm(mean)), 1e-12), normal.shape)
+        return np.where(length > 1e-12, normal / np.maximum(length, 1e-12), flat)
+
+    @property
+    def triangles(self) -> NDArray[np.int64]:
+        """``(T, 3)`` over the flattened grid of points."""
+        rows, columns = self.points.shape[:2]
+        corner = np.arange(rows * columns).reshape(rows, columns)
+        a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]
+        upper = np.stack([a, c, b], axis=-1).reshape(-1, 3)
+        lower = np.stack([b, c, d], axis=-1).reshape(-1, 3)
+        return np.concatenate([upper, lower])
+
+
+def quad(
+    origin: Floats | tuple[float, float, float],
+    along: Floats | tuple[float, float, float],
+    down: Floats | tuple[float, float, float],
+    paint: Paint,
+    *,
+    emission: float = 0.0,
+    texel_scale: float = 1.0,
+) -> Surface:
+    """A rectangle from its top left corner; ``down x along`` points to the viewer."""
+    o, a, d = (np.asarray(v, dtype=np.float64) for v in (origin, along, down))
+    points = np.array([[o, o + a], [o + d, o + d + a]])
+    size = (float(np.linalg.norm(a)), float(np.linalg.norm(d)))
+    return Surface(points, size, paint, emission, texel_scale)
+
+
+def box(
+    low: tuple[float, float, float],
+    size: tuple[float, float, float],
+    paint: Paint | dict[str, Paint],
+    *,
+    yaw: float = 0.0,
+    bottom: bool = False,
+    texel_scale: float = 1.0,
+) -> list[Surface]:
+    """A box from its low corner; ``yaw`` radians turn it about its vertical middle line.
+
+    ``paint`` may name ``+x -x +y -y +z -z`` apart, with ``*`` for the rest.
+    """
+    paints = paint if isinstance(paint, dict) else {"*": paint}
+    sx, sy, sz = size
+    centre = np.array(low) + np.array(size) / 2.0
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    # name: top left corner in half sizes, direction along, direction down
+    faces = {
+        "+x": ((1, -1, 1), (0, sy, 0), (0, 0, -sz)),
+        "-x": ((-1, 1, 1), (0, -sy, 0), (0, 0, -sz)),
+        "+y": ((1, 1, 1), (-sx, 0, 0), (0, 0, -sz)),
+        "-y": ((-1, -1, 1), (sx, 0, 0), (0, 0, -sz)),
+        "+z": ((-1, 1, 1), (sx, 0, 0), (0, -sy, 0)),
+    }
+    if bottom:
+        faces["-z"] = ((-1, -1, -1), (sx, 0, 0), (0, sy, 0))
+    half = np.array(size) / 2.0
+    return [
+        quad(
+            centre + R @ (np.array(corner) * half),
+            R @ np.array(along, dtype=np.float64),
+            R @ np.array(down, dtype=np.float64),
+            paints.get(name, paints.get("*", next(iter(paints.values())))),
+            texel_scale=texel_scale,
+        )
+        for name, (corner, along, down) in faces.items()
+    ]
+
+
+def lathe(
+    base: tuple[float, float, float], profile: list[tuple[float, float]], paint: Paint, *, segments: int = 40
+) -> Surface:
+    """A turned shape: ``profile`` lists ``(radius, height over base)`` from the top down."""
+    angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
+    angle[-1] = 0.0  # close the seam exactly
+    radius, height = (np.array(column) for column in zip(*profile, strict=True))
+    points = np.empty((len(profile), segments + 1, 3))
+    points[..., 0] = base[0] + radius[:, None] * np.cos(angle)
+    points[..., 1] = base[1] + radius[:, None] * np.sin(angle)
+    points[..., 2] = base[2] + height[:, None]
+    length = float(np.sum(np.hypot(np.diff(radius), np.diff(height))))
+    return Surface(points, (float(2.0 * np.pi * radius.max()), length), paint)
+
+
+def cylinder(
+    base: tuple[float, float, float], radius: float, height: float, side: Paint, top: Paint | None = None
+) -> list[Surface]:
+    """An upright cylinder with a lid."""
+    body = lathe(base, [(radius, height), (radius, 0.0)], side)
+    lid = lathe(base, [(1e-4, height), (radius, height)], top or side)
+    return [body, lid]
+
+
+def ellipsoid(
+    centre: tuple[float, float, float], radii: tuple[float, float, float], paint: Paint, *, power: float = 1.0
+) -> Surface:
+    """An ellipsoid; ``power`` below 1 makes it cushion-like (a superellipsoid)."""
+    latitude = np.linspace(np.pi / 2, -np.pi / 2, 25)[:, None]
+    longitude = np.linspace(0.0, 2.0 * np.pi, 49)[None, :].copy()
+    longitude[0, -1] = 0.0
+
+    def bent(value: Floats) -> Floats:
+        return np.sign(value) * np.abs(value) ** power
+
+    points = np.empty((25, 49, 3))
+    points[..., 0] = centre[0] + radii[0] * bent(np.cos(latitude)) * bent(np.cos(longitude))
+    points[..., 1] = centre[1] + radii[1] * bent(np.cos(latitude)) * bent(np.sin(longitude))
+    points[..., 2] = centre[2] + radii[2] * bent(np.sin(latitude)) * np.ones_like(longitude)
+    size = (2.0 * np.pi * max(radii[:2]), np.pi * max(radii))
+    return Surface(points, size, paint)
+
+
+def leaf(
+    root: tuple[float, float, float], heading: float, length: float, width: float, rise: float, paint: Paint
+) -> list[Surface]:
+    """A drooping blade, painted on both sides."""
+    t = np.linspace(0.0, 1.0, 9)
+    middle = np.stack(
+        [
+            root[0] + np.cos(heading) * length * t * (0.5 + 0.5 * t),
+            root[1] + np.sin(heading) * length * t * (0.5 + 0.5 * t),
+            root[2] + rise * (1.6 * t - 0.9 * t**2.5),
+        ],
+        axis=1,
+    )
+    half = 0.5 * width * (np.sin(np.pi * (0.08 + 0.90 * t)) ** 0.8)[:, None]
+    side = np.array([-np.sin(heading), np.cos(heading), 0.0])
+    points = np.stack([middle - half * side, middle, middle + half * side], axis=1)
+    points[:, 1, 2] -= 0.15 * half[:, 0]
+    return [Surface(points, (width, length), paint), Surface(points[:, ::-1], (width, length), paint)]

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can be found out about a frame before its turn comes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamdepth.config import FeatureConfig
+from slamdepth.frontend.features import Features, create_extractor
+from slamdepth.tracking.threads import single_threaded
+from slamdepth.types import Camera, Frame
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A frame's features, and how long they took to find, in milliseconds."""
+
+    features: Features
+    took_ms: float
+
+
+class Preparation:
+    """Finds features; any thread may call it.
+
+    Attributes:
+        levels: sizes the features come in.
+
+    Raises:
+        ConfigError, WeightsError: as ``create_extractor``.
+    """
+
+    def __init__(self, camera: Camera, config: FeatureConfig) -> None:
+        self._camera = camera
+        self._extractor = create_extractor(config)
+        self._in_use = threading.Lock()
+        self.levels = self._extractor.levels
+
+    def __call__(self, frame: Frame) -> Prepared:
+        import cv2
+
+        with self._in_use, single_threaded():
+            start = time.perf_counter()
+            gray = np.asarray(cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+            features = self._extractor.extract(gray, self._camera)
+            return Prepared(features, (time.perf_counter() - start) * 1e3)
+
+
+def load_libraries() -> None:
+    """Import what the first keyframes would import: a second's pause in the middle of tracking."""
+    import gtsam  # noqa: F401
+    import scipy.linalg
+    import scipy.sparse  # noqa: F401

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where training images with depth come from: places, and the readers that open them.
+
+A reader is one file in ``slamdepth/training/readers/`` with a class under
+``@register_reader``. Whoever starts a training may hand in more of them; that is how
+the sequence layouts of ``slamdepth.datasets``, which this room does not know, get here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import logging
+import os
+import pkgutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+from slamdepth.errors import DatasetError
+from slamdepth.types import Camera, Frame
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+logger = logging.getLogger(__name__)
+
+
+class Place(Protocol):
+    """Images with depth taken by one camera, read one at a time.
+
+    Attributes:
+        name: short name; the views made of it are random by seed and name.
+        camera: the camera of all its images.
+        notes: what was guessed, dropped or repaired while opening it, one line each.
+        benchmark: the benchmark a head trained on it has seen, or None.
+        fingerprint: differs where another file, size or camera would give other views.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def notes(self) -> tuple[str, ...]: ...
+    @property
+    def benchmark(self) -> str | None: ...
+    @property
+    def fingerprint(self) -> str: ...
+
+    def __len__(self) -> int: ...
+
+    def read(self, index: int) -> Frame:
+        """Image ``index`` with its depth in metres, both in raw pixels of :attr:`camera`.
+
+        Raises:
+            DatasetError: a file does not decode or has another size than the camera's.
+        """
+        ...
+
+    def down(self, index: int) -> NDArray[np.float64] | None:
+        """Unit direction of gravity ``(3,)`` in the camera's frame of image ``index``; None where the
+        place does not say."""
+        ...
+
+
+class PlaceReader(Protocol):
+    """Opens the folders of one layout.
+
+    Attributes:
+        name: what a source's ``reader`` says.
+        needs: the files it needs, as a user should read them.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def needs(self) -> str: ...
+
+    def matches(self, folder: Path) -> bool:
+        """True where ``folder`` is meant to have this layout, whole or not."""
+        ...
+
+    def open(self, folder: Path) -> Place:
+        """Open ``folder``.
+
+        Raises:
+            DatasetError: a file is missing or malformed, or there is no depth.
+        """
+        ...
+
+
+_ReaderType = TypeVar("_ReaderType", bound=PlaceReader)
+_readers: dict[str, PlaceReader] = {}
+
+
+def register_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
+    """Class decorator that makes a :class:`PlaceReader` known by its name."""
+    reader = reader_type()
+    if reader.name in _readers:
+        raise ValueError(f"two readers of training data are named {reader.name!r}")
+    _readers[reader.name] = reader
+    return reader_type
+
+
+def known_readers() -> dict[str, PlaceReader]:
+    """The readers of this room, by name."""
+    from slamdepth.training import readers
+
+    for module in pkgutil.iter_modules(readers.__path__):
+        importlib.import_module(f"{readers.__name__}.{module.name}")
+    return dict(sorted(_readers.items()))
+
+
+def open_place(
+    folder: Path, reader: str | None = None, more_readers: Mapping[str, PlaceReader] | None = None
+) -> Place:
+    """Open a folder of images with depth.
+
+    Args:
+        reader: name of the reader; None takes the first whose layout the folder has.
+        more_readers: further readers, after those of this room.
+
+    Raises:
+        DatasetError: the folder is missing or of no known layout, there is no such
+            reader, or the reader finds a file missing or malformed.
+    """
+    readers = {**known_readers(), **(more_readers or {})}
+    if reader is not None and reader not in readers:
+        raise DatasetError(f"unknown reader '{reader}' of training data; choose from: {', '.join(readers)}")
+    if not folder.is_dir():
+        raise DatasetError(f"{folder}: no such folder")
+    try:
+        found = reader or next((name for name in readers if readers[name].matches(folder)), None)
+        if found is None:
+            layouts = "; ".join(f"{name} ({known.needs})" for name, known in readers.items())
+            raise DatasetError(f"{folder}: no known layout of training data; known are: {layouts}")
+        place = readers[found].open(folder)
+    except OSError as error:
+        raise DatasetError(f"{folder}: cannot be read: {error.strerror or error}") from error
+    logger.info("%s: %d images with depth, read as '%s'", folder, len(place), found)
+    for note in place.notes:
+        logger.info("%s: %s", place.name, note)
+    return place
+
+
+def data_folder(named: str) -> Path:
+    """The folder as it is named or, where there is none, below ``$SLAMDEPTH_DATA``, should that be set.
+
+    Environment variables and ``~`` are expanded.
+
+    Raises:
+        DatasetError: it does not exist.
+    """
+    path = Path(os.path.expandvars(named)).expanduser()
+    root = os.environ.get("SLAMDEPTH_DATA")
+    if not path.is_absolute() and root and not path.is_dir():
+        path = Path(root) / path
+    if not path.is_dir():
+        hint = "looked below SLAMDEPTH_DATA" if root else "set SLAMDEPTH_DATA, or name it from here"
+        raise DatasetError(f"{path}: no such folder of images with depth ({hint})")
+    return path
+
+
+def fingerprint(paths: Iterable[Path], *more: object) -> str:
+    """Short hash of the names and sizes of files, and of ``more``.
+
+    Raises:
+        OSError: a file is gone.
+    """
+    hashed = hashlib.sha256(repr(more).encode())
+    for path in paths:
+        hashed.update(f"{path.name}:{path.stat().st_size}\n".encode(errors="surrogateescape"))
+    return hashed.hexdigest()[:16]

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a ray meets the raw image of a camera with lens distortion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slamdepth.types import Camera
+from slamdepth.typing import Floats
+
+_STEEPEST = 4.0
+"""Slope of the steepest ray looked at: 76 degrees off the axis."""
+
+
+def raw_pixels(rays: Floats, camera: Camera) -> Floats:
+    """Pixels ``(..., 2)`` of the raw image that rays ``(..., 3)`` with z > 0 come from.
+
+    A distortion polynomial is made for the image; far outside it bends back and would show
+    the image a second time. Rays beyond that turning point go where a lens without
+    distortion sends them, which is outside the image too.
+    """
+    plane = rays[..., :2] / rays[..., 2:]
+    pinhole = plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    if not camera.is_distorted:
+        return np.asarray(pinhole)
+    import cv2
+
+    flat = np.ascontiguousarray(np.concatenate([plane.reshape(-1, 2), np.ones((plane.size // 2, 1))], axis=1))
+    bent, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), camera.K, camera.distortion_array)
+    is_sane = np.linalg.norm(plane, axis=-1) < turning_point(camera)
+    return np.where(is_sane[..., None], np.asarray(bent).reshape(plane.shape), pinhole)
+
+
+def turning_point(camera: Camera) -> float:
+    """The slope of a ray from which on the radial distortion of ``camera`` bends back; infinity
+    where it does not."""
+    k1, k2, _, _, k3 = camera.distortion
+    r2 = np.linspace(0.0, _STEEPEST, 4001) ** 2
+    slope = 1.0 + 3.0 * k1 * r2 + 5.0 * k2 * r2**2 + 7.0 * k3 * r2**3
+    turned = np.flatnonzero(slope <= 0)
+    return float(np.sqrt(r2[turned[0]])) if len(turned) else np.inf

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training pairs: a folder a place, with ``camera.json`` and ``NNNNN.jpg`` + ``NNNNN.png`` files.
+
+``camera.json`` has ``width height fx fy cx cy`` in pixels; where the depth is not in millimetres,
+``depth_unit_m``: metres per unit of the 16-bit depth images; and where the lens distorts both images,
+``distortion``: ``[k1, k2, p1, p2, k3]`` as OpenCV orders them. ``gravity.txt`` may say where
+down is: lines ``NNNNN x y z``, the pair's name and the unit direction of gravity in the camera's frame
+(x right, y down, z forward).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from slamdepth.errors import DatasetError, ImageDecodeError
+from slamdepth.io import read_depth_raw, read_image_rgb
+from slamdepth.training.data import fingerprint, register_reader
+from slamdepth.types import Camera, Frame
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+GRAVITY_FILE = "gravity.txt"
+_IMAGE_ENDINGS = (".jpg", ".jpeg")
+_UNIT_TOLERANCE = 0.01
+_Direction = tuple[float, float, float]
+
+
+class _CameraFile(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    width: int = Field(ge=1)
+    height: int = Field(ge=1)
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+    depth_unit_m: float = Field(0.001, gt=0)
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class PairPlace:
+    """Pairs of one place taken by one camera.
+
+    Attributes:
+        images, depths: file paths, in the same order.
+        depth_unit_m: metres per unit of the depth files.
+        downs: unit direction of gravity in the camera's frame, of each pair; empty where none is known.
+    """
+
+    name: str
+    camera: Camera
+    images: tuple[Path, ...]
+    depths: tuple[Path, ...]
+    depth_unit_m: float
+    notes: tuple[str, ...] = ()
+    benchmark: str | None = None
+    downs: tuple[_Direction | None, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def fingerprint(self) -> str:
+        told = (self.downs,) if self.downs else ()
+        return fingerprint((*self.images, *self.depths), self.camera, self.depth_unit_m, *told)
+
+    def read(self, index: int) -> Frame:
+        """The pair ``index``; see :meth:`slamdepth.training.data.Place.read`."""
+        try:
+            image_rgb, raw = read_image_rgb(self.images[index]), read_depth_raw(self.depths[index])
+        except ImageDecodeError as error:
+            raise DatasetError(str(error)) from error
+        expected = (self.camera.height, self.camera.width)
+        for path, array in ((self.images[index], image_rgb), (self.depths[index], raw)):
+            if array.shape[:2] != expected:
+                raise DatasetError(f"{path}: {array.shape[:2]} pixels, camera.json says {expected}")
+        depth_m = (raw.astype(np.float32) * self.depth_unit_m).astype(np.float32)
+        return Frame(index, float(index), image_rgb, self.camera, depth_m)
+
+    def down(self, index: int) -> NDArray[np.float64] | None:
+        """What gravity.txt says of the pair ``index``, ``(3,)``; None where it says nothing."""
+        found = self.downs[index] if self.downs else None
+        return None if found is None else np.array(found)
+
+
+@register_reader
+class PairReader:
+    """Opens folders of pairs."""
+
+    name = "pairs"
+    needs = "camera.json, NNNNN.jpg + NNNNN.png"
+
+    def matches(self, folder: Path) -> bool:
+        return (folder / "camera.json").is_file()
+
+    def open(self, folder: Path) -> PairPlace:
+        camera, unit = read_camera(folder / "camera.json")
+        try:
+            images = sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGE_ENDINGS)
+            both = [(path, path.with_suffix(".png")) for path in images]
+            pairs = [(image, depth) for image, depth in both if depth.is_file()]
+        except OSError as error:
+            raise DatasetError(f"{folder}: cannot be read: {error.strerror or error}") from error
+        if not pairs:
+            raise DatasetError(f"{folder}: no pair of NNNNN.jpg and NNNNN.png here")
+        alone = len(images) - len(pairs)
+        notes = (f"{alone} of {len(images)} images have no depth image",) if alone else ()
+        told = read_gravity(folder / GRAVITY_FILE) if (folder / GRAVITY_FILE).is_file() else {}
+        return PairPlace(
+            folder.name, camera, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), unit, notes,
+            downs=tuple(told.get(image.stem) for image, _ in pairs) if told else (),
+        )  # fmt: skip
+
+
+def read_camera(path: Path) -> tuple[Camera, float]:
+    """The camera of a ``camera.json``, and metres per unit of the depth images.
+
+    Raises:
+        DatasetError: the file is missing or not readable, or a key is missing, unknown or out of
+            range; names it.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise DatasetError(
+            f"{path.parent}: no camera.json here, so this is no folder of training pairs"
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: not readable: {error}") from error
+    try:
+        said = _CameraFile.model_validate_json(text)
+    except ValidationError as error:
+        raise DatasetError(f"{path}: {_trouble(error)}") from error
+    intrinsics = said.width, said.height, said.fx, said.fy, said.cx, said.cy
+    return Camera(*intrinsics, distortion=said.distortion), said.depth_unit_m
+
+
+def _trouble(error: ValidationError) -> str:
+    first = error.errors()[0]
+    name = ".".join(str(part) for part in first["loc"])
+    if name.startswith("distortion"):
+        return "distortion: needs five finite numbers [k1, k2, p1, p2, k3]"
+    if first["type"] == "missing":
+        return f"the key '{name}' is missing"
+    if first["type"] == "extra_forbidden":
+        return f"unknown key '{name}'; known are {', '.join(_CameraFile.model_fields)}"
+    return f"{name}: {first['msg']}, got {first['input']!r:.40}" if name else f"not readable: {first['msg']}"
+
+
+def read_gravity(path: Path) -> dict[str, _Direction]:
+    """Unit directions of gravity in the camera's frame, by the names of their pairs.
+
+    Raises:
+        DatasetError: a line is not a name and a unit direction; names it.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: not readable: {error}") from error
+    told: dict[str, _Direction] = {}
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        name, *numbers = line.split()
+        try:
+            x, y, z = map(float, numbers)
+        except ValueError:
+            x = y = z = np.nan
+        length = float(np.sqrt(x * x + y * y + z * z))
+        if not abs(length - 1.0) < _UNIT_TOLERANCE:
+            raise DatasetError(f"{path}: line {number}: expected a name and a unit direction x y z: {line!r}")
+        told[name] = (x / length, y / length, z / length)
+    return told
