@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a depth model is, to the rest of the house."""
+"""The interface of a depth model."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ class DepthModel(Protocol):
         name: the registered name.
         kind: what the numbers of its predictions mean.
         weights: every weights file the model uses; empty where it uses none.
+
+    A model may also have ``is_sensor = True``, see :func:`is_sensor`.
     """
 
     name: str
@@ -25,3 +27,11 @@ class DepthModel(Protocol):
     def predict(self, frame: Frame) -> DepthPrediction:
         """Predict ``(H, W)`` depth for ``frame`` at the frame's own resolution."""
         ...
+
+
+def is_sensor(model: DepthModel) -> bool:
+    """Whether ``model`` passes measured depth on; it says so by an attribute ``is_sensor``, absent means no.
+
+    A sensor costs no time, may have no depth for a frame, and its scale is exact.
+    """
+    return bool(getattr(model, "is_sensor", False))

@@ -21,6 +21,7 @@ class SensorDepth:
 
     name = "sensor"
     kind = DepthKind.METRIC
+    is_sensor = True
     weights: tuple[WeightsInfo, ...] = ()
 
     def __init__(self, *, device: str = "cpu", seed: int = 0) -> None:
