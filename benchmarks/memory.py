@@ -91,7 +91,7 @@ def measure(
     done = tracker.finish()
     figures = {
         "lost": lost,
-        "loops": done.loop_closures,
+        "loops": done.statistics.loop_closures,
         "resident_after_finish_mib": memory_mib("VmRSS"),
         "peak_mib": memory_mib("VmHWM"),
     }

@@ -39,9 +39,9 @@ class SlamDepth:
         done = self._tracker.finish()
         counts = {
             "keyframes": len(done.keyframes),
-            "loops": done.loop_closures,
-            "relocalisations": done.relocalisations,
-            "rescues": done.rescues,
+            "loops": done.statistics.loop_closures,
+            "relocalisations": done.statistics.relocalisations,
+            "registrations": done.statistics.registrations,
         }
         keyframes = keyframe_trajectory(done) if done.keyframes else None
         return Estimate(done.trajectory, keyframes, counts)

@@ -29,14 +29,16 @@ if TYPE_CHECKING:
     )
     from slamdepth.evaluation import score_trajectory
     from slamdepth.io import read_tum_trajectory, write_tum_trajectory
+    from slamdepth.mapping.keyframe import Keyframe
+    from slamdepth.mapping.mesh import Mesh
+    from slamdepth.mapping.reconstruction import Reconstruction
     from slamdepth.tracking import Tracker, create_tracker
     from slamdepth.types import (
         Camera,
         DepthKind,
         DepthPrediction,
         Frame,
-        Keyframe,
-        Reconstruction,
+        RunStatistics,
         StepResult,
         TrackingStatus,
         Trajectory,
@@ -56,9 +58,11 @@ _HOME = {
     "Frame": "slamdepth.types",
     "ImageDecodeError": "slamdepth.errors",
     "InputError": "slamdepth.errors",
-    "Keyframe": "slamdepth.types",
+    "Keyframe": "slamdepth.mapping.keyframe",
+    "Mesh": "slamdepth.mapping.mesh",
     "OutputError": "slamdepth.errors",
-    "Reconstruction": "slamdepth.types",
+    "Reconstruction": "slamdepth.mapping.reconstruction",
+    "RunStatistics": "slamdepth.types",
     "SlamdepthError": "slamdepth.errors",
     "StepResult": "slamdepth.types",
     "Tracker": "slamdepth.tracking",
@@ -89,8 +93,10 @@ __all__ = [
     "ImageDecodeError",
     "InputError",
     "Keyframe",
+    "Mesh",
     "OutputError",
     "Reconstruction",
+    "RunStatistics",
     "SlamdepthError",
     "StepResult",
     "Tracker",

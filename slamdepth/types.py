@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The value types every room of the house speaks.
+"""The value types that all packages share.
 
 Conventions, everywhere: poses are ``(4, 4)`` float64 named ``T_world_camera`` with
 ``p_world = T_world_camera @ p_camera``; camera axes are x right, y down, z forward;
@@ -9,7 +9,6 @@ metres, 0 where unknown.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING
@@ -210,7 +209,7 @@ class TrackingStatus(str, Enum):
     INITIALISING = "initialising"
     TRACKING = "tracking"
     RELOCALISED = "relocalised"
-    RESCUED = "rescued by registration"
+    REGISTERED = "placed by registration"
     LOST = "lost"
 
 
@@ -265,90 +264,30 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
-class Keyframe:
-    """A keyframe after optimisation, with what the map fusion needs.
-
-    Images and predictions of a tracker's keyframes may be read when they are asked for, each
-    time anew, because those of all keyframes together may be more than memory holds. Dense depth in
-    metres of the map is made each time for the same reason.
+class RunStatistics:
+    """Counts, times and estimates of one run, for reports and benchmarks.
 
     Attributes:
-        id: number of the keyframe, from 0.
-        frame: its image (and sensor depth where there is one).
-        T_world_camera: ``(4, 4)`` optimised pose.
-        keypoints_px: ``(N, 2)`` float64 raw pixels.
-        depth_scale: factor that turned the prediction into metres of the map.
-        prediction: the map before scaling, as the model gave it.
-        in_metres: what makes :attr:`depth_m` of the prediction.
+        frames: frames given to the tracker.
+        tracked: frames that have a pose.
+        loop_closures, relocalisations, registrations: how often a loop was closed, and how many frames were
+            placed by relocalisation and by point-cloud registration.
+        timings_ms: mean wall time in milliseconds per call of each stage.
+        timing_calls: number of calls of each stage.
+        readout_s: readout time of the rolling shutter in seconds, first image row to last; 0 for a global
+            shutter, None where the odometry does not model it.
+        readout_sigma_s: standard deviation of ``readout_s`` in seconds; None where it was not estimated.
+        scale_votes: log ratio of the map's depth to the predicted depth, one per keyframe with enough
+            points; their robust centre is 0 at the map's own scale. Empty with a sensor.
     """
 
-    id: int
-    frame: Frame
-    T_world_camera: NDArray[np.float64]
-    keypoints_px: NDArray[np.float64]
-    depth_scale: float
-    prediction: DepthPrediction
-    in_metres: Callable[[DepthPrediction], NDArray[np.float32]]
-
-    @property
-    def depth_m(self) -> NDArray[np.float32]:
-        """``(H, W)`` metres of the map, 0 where unknown or dropped; in the raw (distorted) pixels of
-        the frame."""
-        return self.in_metres(replace(self.prediction))  # read once, should it lie on disk
-
-    @property
-    def sigma_log(self) -> NDArray[np.float32] | None:
-        """``(H, W)`` or None; see :class:`DepthPrediction`."""
-        return self.prediction.sigma_log
-
-    def rescaled(self, factor: float) -> Keyframe:
-        """The keyframe in a map whose lengths were multiplied by ``factor``.
-
-        Prediction and sensor depth stay as they were given; what the map makes of them changes.
-        """
-        T = self.T_world_camera.copy()
-        T[:3, 3] *= factor
-        return replace(
-            self,
-            T_world_camera=T,
-            depth_scale=self.depth_scale * factor,
-            in_metres=lambda prediction: self.in_metres(prediction) * np.float32(factor),
-        )
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """What ``Tracker.finish`` returns.
-
-    Attributes:
-        trajectory: every placed frame after optimisation.
-        keyframes: the optimised keyframes in order of time.
-        points_m: ``(P, 3)`` float64 map points in the world frame, metres of the map.
-        frames, tracked, loop_closures, relocalisations, rescues: counts over the run.
-        timings_ms: mean milliseconds per call of each stage.
-        timing_calls: how often each of them was called.
-        scale_votes: log ratio of the map's depths to the predicted ones, one for each
-            keyframe that could tell; the map's scale is where their robust centre is 0. Empty
-            where nothing was voted on, as with a sensor.
-        readout_s: seconds the camera took from an image's first row to its last, as the
-            trajectory was made with; 0 for a global shutter, None where it plays no part.
-        readout_sigma_s: its deviation where it was found out, None where it was given.
-        down_w: ``(3,)`` unit direction of gravity in the world frame, by what most keyframes' images tell;
-            None where none was told or they disagree, as with a sensor.
-    """
-
-    trajectory: Trajectory
-    keyframes: tuple[Keyframe, ...]
-    points_m: NDArray[np.float64]
-    frames: int
-    tracked: int
-    loop_closures: int
-    relocalisations: int
-    rescues: int
+    frames: int = 0
+    tracked: int = 0
+    loop_closures: int = 0
+    relocalisations: int = 0
+    registrations: int = 0
     timings_ms: dict[str, float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    scale_votes: tuple[float, ...] = ()
+    timing_calls: dict[str, int] = field(default_factory=dict)
     readout_s: float | None = None
     readout_sigma_s: float | None = None
-    down_w: NDArray[np.float64] | None = None
-    timing_calls: dict[str, int] = field(default_factory=dict)
+    scale_votes: tuple[float, ...] = ()

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from slamdepth.errors import CameraError, ImageDecodeError
-from slamdepth.types import Camera, Frame, Reconstruction, StepResult, TrackingStatus, Trajectory
+from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.types import Camera, Frame, RunStatistics, StepResult, TrackingStatus, Trajectory
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
 
@@ -74,6 +75,5 @@ class MadeUpTracker:
     def finish(self) -> Reconstruction:
         placed = [i for i in self.seen if i not in self.lost]
         trajectory = Trajectory(np.array(placed) / 10.0, np.array([pose(i) for i in placed]))
-        return Reconstruction(
-            trajectory, (), np.zeros((0, 3)), len(self.seen), len(placed), 0, 0, 0, {"tracking": 1.0}
-        )
+        statistics = RunStatistics(len(self.seen), len(placed), timings_ms={"tracking": 1.0})
+        return Reconstruction(trajectory, (), np.zeros((0, 3)), statistics=statistics)

@@ -22,9 +22,10 @@ from slamdepth.depth.sensor import SensorDepth
 from slamdepth.mapping import landmarks
 from slamdepth.mapping.keyframe_store import KeyframeStore, NamelessFile, StoredFrame, StoredPrediction
 from slamdepth.mapping.packing import Numbers, pack_image, pack_measured, pack_predicted, unpack_image
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.known_size import rescaled
 from slamdepth.tracking import frame_log
-from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Reconstruction
+from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5, depth_factor=5000.0)
 
@@ -231,7 +232,7 @@ def test_a_run_with_nothing_in_memory_is_the_same_run(depth: str) -> None:
         plain, away = (reconstruction(mib, scene.colour_only, scene.ConstantDepth()) for mib in (1e3, 0.0))
     np.testing.assert_array_equal(plain.trajectory.T_world_camera, away.trajectory.T_world_camera)
     np.testing.assert_array_equal(plain.points_m, away.points_m)
-    assert plain.scale_votes == away.scale_votes
+    assert plain.statistics.scale_votes == away.statistics.scale_votes
     assert len(plain.keyframes) == len(away.keyframes) > 8
     assert isinstance(away.keyframes[0].frame, StoredFrame)
     for a, b in zip(plain.keyframes, away.keyframes, strict=True):

@@ -423,4 +423,4 @@ def test_loops_can_be_switched_off() -> None:
 def test_no_loop_on_a_walk_that_never_returns() -> None:
     config = WALK_CONFIG.model_copy(update={"loops": CONFIG.loops})
     made = Run(frames(range(0, 30)), config=config).finish()
-    assert made.loop_closures == 0
+    assert made.statistics.loop_closures == 0

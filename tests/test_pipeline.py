@@ -93,8 +93,8 @@ def test_every_placed_frame_is_in_the_online_trajectory(tmp_path: Path) -> None:
     assert tracked.skipped == 1
     assert not tracked.interrupted
     assert tracked.fps > 0
-    assert {"tracking", "finish", "decode"} <= set(tracked.reconstruction.timings_ms)
-    calls = tracked.reconstruction.timing_calls
+    assert {"tracking", "finish", "decode"} <= set(tracked.reconstruction.statistics.timings_ms)
+    calls = tracked.reconstruction.statistics.timing_calls
     assert (calls["finish"], calls["decode"]) == (1, len(tracked.steps))
     assert "1 of 10 images do not decode" in " ".join(tracked.notes)
 
@@ -113,7 +113,7 @@ def test_a_stop_finishes_with_what_there_is(tmp_path: Path) -> None:
     tracker = MadeUpTracker(on_step=lambda frame: stop.set() if frame.index == 4 else None)
     tracked = tracked_of(MadeUpDataset(10), tracker, tmp_path, stop=stop)
     assert tracked.interrupted
-    assert tracked.reconstruction.frames == 5
+    assert tracked.reconstruction.statistics.frames == 5
     assert tracked.notes == ("interrupted after 5 of 10 frames",)
 
 

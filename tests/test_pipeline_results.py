@@ -8,8 +8,10 @@ import pytest
 from made_up import MadeUpDataset, pose
 
 from slamdepth.depth.alignment import as_given
+from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.results import judge_trajectory, keyframe_trajectory, score_depth
-from slamdepth.types import DepthKind, DepthPrediction, Keyframe, Reconstruction, Trajectory
+from slamdepth.types import DepthKind, DepthPrediction, Trajectory
 
 
 def keyframe(number: int, scale: float, *, is_sensor: bool = False) -> Keyframe:
@@ -80,9 +82,9 @@ def test_a_sensor_whose_scale_is_not_the_truths_is_a_note(
 def test_keyframes_become_a_trajectory() -> None:
     frames = (keyframe(0, 1.0), keyframe(3, 1.0))
     trajectory = Trajectory(np.zeros(0), np.zeros((0, 4, 4)), is_metric=False)
-    found = keyframe_trajectory(Reconstruction(trajectory, frames, np.zeros((0, 3)), 0, 0, 0, 0, 0))
+    found = keyframe_trajectory(Reconstruction(trajectory, frames, np.zeros((0, 3))))
     assert found.timestamps_s.tolist() == [0.0, 0.3]
     assert found.T_world_camera[:, 0, 3].tolist() == [0.0, 3.0]
     assert not found.is_metric
-    empty = keyframe_trajectory(Reconstruction(trajectory, (), np.zeros((0, 3)), 0, 0, 0, 0, 0))
+    empty = keyframe_trajectory(Reconstruction(trajectory, (), np.zeros((0, 3))))
     assert len(empty) == 0

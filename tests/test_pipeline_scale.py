@@ -20,6 +20,8 @@ from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.geometry import se3_exp
 from slamdepth.mapping.floor import find_floor
+from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.known_size import (
     ScaleEstimate,
     from_baseline,
@@ -36,7 +38,7 @@ from slamdepth.pipeline.prediction_scale import (
 from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.report import ScaleFacts, ScaleSource
-from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Keyframe, Reconstruction, Trajectory
+from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, RunStatistics, Trajectory
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 VOTES = (-0.1, -0.05, 0.0, 0.05, 0.1)
@@ -96,8 +98,8 @@ def reconstruction_of(
     votes: tuple[float, ...] = VOTES,
 ) -> Reconstruction:
     points = np.random.default_rng(0).normal(size=(20, 3))
-    n = 60
-    return Reconstruction(trajectory or walk(), keyframes, points, n, n, 0, 0, 0, scale_votes=votes)
+    statistics = RunStatistics(60, 60, scale_votes=votes)
+    return Reconstruction(trajectory or walk(), keyframes, points, statistics=statistics)
 
 
 class Network(ConstantDepth):
@@ -137,8 +139,8 @@ def test_no_floor_no_height() -> None:
 @pytest.mark.parametrize("tilt_deg", [20.0, 50.0, 70.0])
 def test_known_gravity_finds_the_floor_however_the_camera_is_held(tilt_deg: float) -> None:
     tilt = math.radians(tilt_deg)
-    down_w = se3_exp(np.array([0, 0, 0, -tilt, 0, 0]))[:3, :3].T @ np.array([0.0, 1.0, 0.0])
-    floor = find_floor(room(1.4, None, tilt), 4.0, down_w=down_w)
+    gravity_w = se3_exp(np.array([0, 0, 0, -tilt, 0, 0]))[:3, :3].T @ np.array([0.0, 1.0, 0.0])
+    floor = find_floor(room(1.4, None, tilt), 4.0, gravity_w=gravity_w)
     assert floor is not None
     assert floor.height == pytest.approx(1.4, rel=0.01)
     assert floor.tilt_deg < 1.0
@@ -208,7 +210,7 @@ def test_rescaling_multiplies_every_length_and_nothing_else() -> None:
         np.testing.assert_array_equal(a.T_world_camera[:3, 3], 2 * b.T_world_camera[:3, 3])
         np.testing.assert_array_equal(a.T_world_camera[:3, :3], b.T_world_camera[:3, :3])
         assert (a.depth_scale, a.prediction) == (2 * b.depth_scale, b.prediction)
-    np.testing.assert_allclose(after.scale_votes, np.array(VOTES) + math.log(2))
+    np.testing.assert_allclose(after.statistics.scale_votes, np.array(VOTES) + math.log(2))
     back = rescaled(after, 0.5)
     np.testing.assert_allclose(back.points_m, before.points_m)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slamdepth.mapping.mesh import TriangleMesh
+from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.raycast import render_mesh
 from slamdepth.types import Camera
 
@@ -13,17 +13,17 @@ CAMERA = Camera(60, 40, 40.0, 40.0, 29.5, 19.5)
 BEHIND = (10, 20, 30)
 
 
-def wall(z_m: float, colors: list[list[float]], *, is_turned: bool = False) -> TriangleMesh:
+def wall(z_m: float, colors: list[list[float]], *, is_turned: bool = False) -> Mesh:
     """A square of 1 m across the camera's axis, facing a camera at the origin unless turned away."""
     corners = np.array([[-0.5, -0.5, z_m], [0.5, -0.5, z_m], [0.5, 0.5, z_m], [-0.5, 0.5, z_m]], np.float32)
     triangles = np.array([[0, 2, 1], [0, 3, 2]], np.int32)
     if is_turned:
         triangles = triangles[:, ::-1].copy()
-    return TriangleMesh(corners, triangles, np.array(colors, np.float32))
+    return Mesh(corners, triangles, np.array(colors, np.float32))
 
 
-def both(one: TriangleMesh, other: TriangleMesh) -> TriangleMesh:
-    return TriangleMesh(
+def both(one: Mesh, other: Mesh) -> Mesh:
+    return Mesh(
         np.concatenate([one.vertices_m, other.vertices_m]),
         np.concatenate([one.triangles, other.triangles + len(one.vertices_m)]),
         np.concatenate([one.colors, other.colors]),
@@ -71,18 +71,18 @@ def test_a_mesh_without_colours_is_grey_and_shaded() -> None:
     black = [[0, 0, 0]] * 4
     flat = wall(2.0, black)
     away = np.array([[0, 0, 0], [0, 0, 1], [0, 0, 1], [0, 0, 0]], np.float32)
-    steep = TriangleMesh(flat.vertices_m + away, flat.triangles, flat.colors)
+    steep = Mesh(flat.vertices_m + away, flat.triangles, flat.colors)
     one, other = (render_mesh(m, CAMERA, np.eye(4), BEHIND) for m in (flat, steep))
     assert one[20, 25, 0] == one[20, 25, 1] == one[20, 25, 2] > 200
     assert BEHIND[0] < other[20, 25, 0] < one[20, 25, 0]
 
 
 def test_nothing_is_the_background_and_the_same_mesh_the_same_bytes() -> None:
-    assert (render_mesh(TriangleMesh.empty(), CAMERA, np.eye(4), BEHIND) == BEHIND).all()
+    assert (render_mesh(Mesh.empty(), CAMERA, np.eye(4), BEHIND) == BEHIND).all()
     rng = np.random.default_rng(0)
     vertices = rng.normal(size=(300, 3)).astype(np.float32) + np.float32([0, 0, 3])
     triangles = rng.permutation(300).reshape(-1, 3).astype(np.int32)
-    mesh = TriangleMesh(vertices, triangles, rng.uniform(size=(300, 3)).astype(np.float32))
+    mesh = Mesh(vertices, triangles, rng.uniform(size=(300, 3)).astype(np.float32))
     first = render_mesh(mesh, CAMERA, np.eye(4), BEHIND)
     assert (first != BEHIND).any()
     np.testing.assert_array_equal(first, render_mesh(mesh, CAMERA, np.eye(4), BEHIND))

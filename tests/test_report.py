@@ -25,6 +25,8 @@ from slamdepth.depth.alignment import as_given
 from slamdepth.errors import OutputError
 from slamdepth.evaluation import DepthScorer, score_trajectory
 from slamdepth.geometry import se3_exp
+from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report import (
     MeshCounts,
     ReportData,
@@ -46,8 +48,7 @@ from slamdepth.types import (
     DepthKind,
     DepthPrediction,
     Frame,
-    Keyframe,
-    Reconstruction,
+    RunStatistics,
     StepResult,
     TrackingStatus,
     Trajectory,
@@ -111,14 +112,15 @@ def full_data() -> ReportData:
             trajectory=estimate,
             keyframes=keyframes,
             points_m=np.random.default_rng(0).normal(size=(500, 3)),
-            frames=COUNT,
-            tracked=70,
-            loop_closures=1,
-            relocalisations=1,
-            rescues=0,
-            timings_ms={"features": 7.5, "depth": 180.0},
-            timing_calls={"features": 80, "depth": 6},
             notes=("the tracker's <note>",),
+            statistics=RunStatistics(
+                frames=COUNT,
+                tracked=70,
+                loop_closures=1,
+                relocalisations=1,
+                timings_ms={"features": 7.5, "depth": 180.0},
+                timing_calls={"features": 80, "depth": 6},
+            ),
         ),
         fps=12.5,
         config=Config(),
@@ -138,7 +140,7 @@ def full_data() -> ReportData:
 def bare_data() -> ReportData:
     """A run that was stopped before its first frame."""
     nothing = Trajectory(np.empty(0), np.empty((0, 4, 4)))
-    run = Reconstruction(nothing, (), np.empty((0, 3)), 0, 0, 0, 0, 0)
+    run = Reconstruction(nothing, (), np.empty((0, 3)))
     return ReportData(
         "empty", "sensor", run, 0.0, Config(), ScaleFacts(ScaleSource.SENSOR, 1.0, "The sensor's.")
     )
@@ -281,7 +283,7 @@ def test_plots_are_valid_svg_in_the_colours_of_the_page() -> None:
         "ate": report_plots.ate_plot(score),
         "rpe": report_plots.rpe_plot(score),
         "position": report_plots.position_plot(run, score),
-        "timings": speed_plot(stage_times(run.timings_ms, run.timing_calls, 6.4)),
+        "timings": speed_plot(stage_times(run.statistics.timings_ms, run.statistics.timing_calls, 6.4)),
         "scale": report_plots.scale_plot(run.keyframes),
     }
     ids: list[str] = []

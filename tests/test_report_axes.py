@@ -51,11 +51,11 @@ def test_without_gravity_the_axes_are_the_first_cameras_and_named_so() -> None:
 
 def test_the_report_says_which_axes_it_draws() -> None:
     data = full_data()
-    known = replace(data.reconstruction, down_w=DOWN)
+    known = replace(data.reconstruction, gravity_w=DOWN)
     for run in (data.reconstruction, known):
         page = build_html(replace(data, reconstruction=run), build_summary(data))
         assert ("from above (gravity-aligned)" in page) is (run is known)
         assert ("first camera's x–z" in page) is (run is not known)
-        assert page.count(about_views(run.down_w)) == 2
+        assert page.count(about_views(run.gravity_w)) == 2
     for draw in (map_plot, lambda run: trajectory_plot(run, data.trajectory_score)):
-        assert draw(known) != draw(replace(known, down_w=so3_exp(np.array([0.5, 0.0, 0.0])) @ DOWN))
+        assert draw(known) != draw(replace(known, gravity_w=so3_exp(np.array([0.5, 0.0, 0.0])) @ DOWN))

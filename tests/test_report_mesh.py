@@ -13,16 +13,17 @@ from test_report import bare_data, full_data
 from slamdepth.errors import OutputError
 from slamdepth.geometry import invert, project, so3_exp, transform
 from slamdepth.io import read_image_rgb
-from slamdepth.mapping.mesh import TriangleMesh
+from slamdepth.mapping.mesh import Mesh
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report import MeshPicture, build_html, build_summary, mesh_pictures, write_mesh_png
 from slamdepth.report.viewpoints import from_above, guessed_down, look_at, over_the_shoulder, picture_camera
-from slamdepth.types import Reconstruction, Trajectory
+from slamdepth.types import Trajectory
 
 DOWN = np.array([0.0, 1.0, 0.0])
 CAMERA = picture_camera(90, 60, 50.0)
 
 
-def corner_room() -> TriangleMesh:
+def corner_room() -> Mesh:
     """A floor 1.5 m below the camera and a wall 3 m ahead of it, in patches of 10 cm; their fronts inside."""
     at = np.arange(-1.5, 1.5, 0.1)
     u, v = (grid.ravel() for grid in np.meshgrid(at, at))
@@ -36,7 +37,7 @@ def corner_room() -> TriangleMesh:
     triangles += [wall_quads[:, [0, 2, 1]], wall_quads[:, [1, 2, 3]]]
     fronts = np.concatenate(triangles).astype(np.int32)
     colors = np.where(np.arange(len(vertices))[:, None] < 4 * len(u), [0.8, 0.2, 0.1], [0.1, 0.3, 0.8])
-    return TriangleMesh(vertices.astype(np.float32), fronts, colors.astype(np.float32))
+    return Mesh(vertices.astype(np.float32), fronts, colors.astype(np.float32))
 
 
 def walk() -> np.ndarray:
@@ -48,9 +49,9 @@ def walk() -> np.ndarray:
     return T
 
 
-def room_run(down_w: np.ndarray | None = DOWN) -> Reconstruction:
+def room_run(gravity_w: np.ndarray | None = DOWN) -> Reconstruction:
     run = bare_data().reconstruction
-    return replace(run, trajectory=Trajectory(np.arange(10.0), walk()), down_w=down_w)
+    return replace(run, trajectory=Trajectory(np.arange(10.0), walk()), gravity_w=gravity_w)
 
 
 def test_from_above_all_is_in_the_picture_and_the_eye_is_above_on_the_side_of_the_fronts() -> None:
@@ -112,7 +113,7 @@ def test_two_pictures_say_what_they_know_of_up() -> None:
 def test_little_is_drawn_of_little(poses: int) -> None:
     run = room_run()
     run = replace(run, trajectory=Trajectory(np.arange(float(poses)), walk()[:poses]))
-    assert mesh_pictures(TriangleMesh.empty(), run) == ()
+    assert mesh_pictures(Mesh.empty(), run) == ()
     assert len(mesh_pictures(corner_room(), run)) == 2 * poses
 
 

@@ -19,11 +19,12 @@ from slamdepth.frontend.features import Features
 from slamdepth.frontend.rolling_shutter import at_middle_row, px_per_readout_s, row_phase, velocity_between
 from slamdepth.geometry import backproject, invert, project, se3_exp, so3_exp, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.tracking import create_tracker
 from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.localiser import Placement
 from slamdepth.tracking.shutter import Shutter
-from slamdepth.types import Camera, Frame, Reconstruction
+from slamdepth.types import Camera, Frame
 
 PINHOLE = Camera(640, 480, 520.0, 510.0, 319.0, 241.0)
 READOUT_S = 0.03
@@ -190,13 +191,13 @@ def rolling_frames() -> list[Frame]:
 
 def test_the_readout_time_is_found_and_the_trajectory_better_for_it(rolling_frames: list[Frame]) -> None:
     found = tracked(rolling_frames)
-    assert found.readout_sigma_s is not None
+    assert found.statistics.readout_sigma_s is not None
     # seven keyframes of 320 x 240: noisy velocities make it too short
-    assert 0.6 * READOUT_S < (found.readout_s or 0.0) < 1.1 * READOUT_S
+    assert 0.6 * READOUT_S < (found.statistics.readout_s or 0.0) < 1.1 * READOUT_S
     ignoring = Config.from_dict({**CONFIG.model_dump(), "shutter": {"readout_ms": 0}})
     ignored = tracked(rolling_frames, ignoring)
-    assert ignored.readout_s == 0.0
-    assert ignored.readout_sigma_s is None
+    assert ignored.statistics.readout_s == 0.0
+    assert ignored.statistics.readout_sigma_s is None
     assert ate_m(found.trajectory) < 0.5 * ate_m(ignored.trajectory)
 
 
@@ -206,14 +207,14 @@ def test_a_phone_held_upright_rolls_along_the_width(rolling_frames: list[Frame])
     for frame in turned:
         tracker.step(frame)
     found = tracker.finish()
-    assert 0.6 * READOUT_S < (found.readout_s or 0.0) < 1.1 * READOUT_S
+    assert 0.6 * READOUT_S < (found.statistics.readout_s or 0.0) < 1.1 * READOUT_S
     # the camera turned, its path did not
     assert ate_m(found.trajectory) < 2.0 * ate_m(tracked(rolling_frames).trajectory)
 
 
 def test_a_global_shutter_is_recognised() -> None:
     found = tracked(frames(change=lambda frame: shaken(frame, 0.0)))
-    assert abs(found.readout_s or 0.0) < 0.004
+    assert abs(found.statistics.readout_s or 0.0) < 0.004
 
 
 @pytest.mark.parametrize("cut", [30, 44])

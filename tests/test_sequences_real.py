@@ -16,8 +16,9 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.evaluation import score_trajectory
 from slamdepth.geometry import invert
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.tracking import Tracker
-from slamdepth.types import Frame, Reconstruction, StepResult, TrackingStatus, Trajectory
+from slamdepth.types import Frame, StepResult, TrackingStatus, Trajectory
 
 pytestmark = pytest.mark.data
 
@@ -39,7 +40,7 @@ def run_beginning(folder: Path, count: int, model: DepthModel) -> tuple[Reconstr
         result = tracker.step(dataset.read(index, with_depth=model.name == "sensor"))
         assert result.status is TrackingStatus.TRACKING, f"frame {index}: {result.status.value}"
     made = tracker.finish()
-    assert made.tracked == made.frames == count
+    assert made.statistics.tracked == made.statistics.frames == count
     assert np.isfinite(made.trajectory.T_world_camera).all()
     return made, truth
 
@@ -104,7 +105,7 @@ def test_two_seconds_of_black_frames_in_the_kitchen(data_dir: Path) -> None:
     # alignment by the first pose alone: a milliradian there is millimetres here; the camera moves by 0.9 m
     assert errors[found:].max() < 0.15
     made = tracker.finish()
-    assert made.relocalisations == 1
+    assert made.statistics.relocalisations == 1
     assert score_trajectory(truth, made.trajectory).se3.rmse_m < 0.06
 
 

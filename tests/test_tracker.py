@@ -27,9 +27,10 @@ from slamdepth.depth.robust_centre import robust_centre
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import CameraError, ConfigError, TrackingError
 from slamdepth.geometry import invert, rotation_angle_rad, transform
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.tracking import CloudTracker, Tracker, create_tracker
 from slamdepth.tracking.map_adjuster import MapAdjuster
-from slamdepth.types import DepthKind, DepthPrediction, Frame, Reconstruction, TrackingStatus
+from slamdepth.types import DepthKind, DepthPrediction, Frame, TrackingStatus
 
 DOWN_W = np.array([0.1, 0.9, 0.3]) / np.linalg.norm([0.1, 0.9, 0.3])
 
@@ -59,7 +60,7 @@ def test_a_constant_prior_tracks_every_frame_up_to_scale(constant_run: tuple[Run
     run, reconstruction = constant_run
     assert run.statuses() == {TrackingStatus.TRACKING: COUNT}
     assert ate_m(reconstruction.trajectory, with_scale=True) < 0.02
-    votes = reconstruction.scale_votes
+    votes = reconstruction.statistics.scale_votes
     assert 2 <= len(votes) <= len(reconstruction.keyframes)
     assert abs(robust_centre(np.array(votes))) < 1e-9
     assert np.std(votes) > 0.01
@@ -75,8 +76,9 @@ def test_the_reconstruction_is_consistent(
         np.testing.assert_allclose(trajectory.T_world_camera[0], np.eye(4), atol=1e-12)
         R = trajectory.T_world_camera[:, :3, :3]
         np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-9)
-        assert made.frames == made.tracked == len(trajectory) == COUNT
-        assert made.relocalisations == made.rescues == made.loop_closures == 0
+        statistics = made.statistics
+        assert statistics.frames == statistics.tracked == len(trajectory) == COUNT
+        assert statistics.relocalisations == statistics.registrations == statistics.loop_closures == 0
         assert len(made.keyframes) == run.results[-1].keyframes == sum(r.is_keyframe for r in run.results)
         assert 3 <= len(made.keyframes) <= COUNT // 4
         assert [k.id for k in made.keyframes] == list(range(len(made.keyframes)))
@@ -93,11 +95,11 @@ def test_the_reconstruction_is_consistent(
         assert made.points_m.shape[1] == 3
         assert len(made.points_m) > 200
         assert np.isfinite(made.points_m).all()
-        assert set(made.timings_ms) >= {"features", "tracking", "depth", "mapping", "bundle"}
-        assert all(ms >= 0 for ms in made.timings_ms.values())
-        assert made.timing_calls.keys() == made.timings_ms.keys()
-        assert made.timing_calls["features"] == COUNT
-        assert made.timing_calls["final"] == 1
+        assert set(made.statistics.timings_ms) >= {"features", "tracking", "depth", "mapping", "bundle"}
+        assert all(ms >= 0 for ms in made.statistics.timings_ms.values())
+        assert made.statistics.timing_calls.keys() == made.statistics.timings_ms.keys()
+        assert made.statistics.timing_calls["features"] == COUNT
+        assert made.statistics.timing_calls["final"] == 1
 
 
 class ToldDown(ConstantDepth):
@@ -112,13 +114,13 @@ def test_gravity_that_the_images_told_is_handed_on_in_the_world(
     sensor_run: tuple[Run, Reconstruction], constant_run: tuple[Run, Reconstruction]
 ) -> None:
     made = Run(frames(change=colour_only), ToldDown()).finish()
-    assert made.down_w is not None
-    assert np.linalg.norm(made.down_w) == pytest.approx(1.0)
-    assert made.down_w @ DOWN_W > np.cos(np.radians(1.0))
+    assert made.gravity_w is not None
+    assert np.linalg.norm(made.gravity_w) == pytest.approx(1.0)
+    assert made.gravity_w @ DOWN_W > np.cos(np.radians(1.0))
     np.testing.assert_array_equal(  # a model that does not listen: nothing else may change
         made.trajectory.T_world_camera, constant_run[1].trajectory.T_world_camera
     )
-    assert sensor_run[1].down_w is constant_run[1].down_w is None
+    assert sensor_run[1].gravity_w is constant_run[1].gravity_w is None
 
 
 def test_steps_say_what_was_done(sensor_run: tuple[Run, Reconstruction]) -> None:
@@ -190,7 +192,7 @@ def test_kiss_icp_behind_the_same_interface() -> None:
     assert run.statuses() == {TrackingStatus.TRACKING: 30}
     made = run.finish()
     assert ate_m(made.trajectory) < 0.005
-    assert made.tracked == len(made.trajectory) == 30
+    assert made.statistics.tracked == len(made.trajectory) == 30
     assert len(made.keyframes) == run.results[-1].keyframes >= 1
     with pytest.raises(TrackingError, match="finished"):
         run.tracker.step(frames([40])[0])
@@ -219,7 +221,7 @@ def test_what_a_tracker_refuses(odometry: str) -> None:
     with pytest.raises(CameraError, match="another camera"):
         tracker.step(replace(second, camera=other))
     assert tracker.step(second).status is TrackingStatus.TRACKING  # none of that did any harm
-    assert tracker.finish().tracked == 2
+    assert tracker.finish().statistics.tracked == 2
     with pytest.raises(TrackingError, match="finished"):
         tracker.finish()
     with pytest.raises(TrackingError, match="finished"):
@@ -242,7 +244,7 @@ def test_relative_depth_is_refused_before_anything_is_built_on_it() -> None:
 @pytest.mark.parametrize("predicted", [False, True])
 def test_a_run_may_end_at_once(indices: list[int], predicted: bool) -> None:
     made = Run(frames(indices), ConstantDepth() if predicted else None).finish()
-    assert made.tracked == len(indices)
+    assert made.statistics.tracked == len(indices)
     assert len(made.keyframes) >= 1
     assert made.keyframes[0].depth_m.shape == (CAMERA.height, CAMERA.width)
     assert made.points_m.shape[1] == 3

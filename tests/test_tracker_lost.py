@@ -24,7 +24,7 @@ from slamdepth.geometry import se3_exp
 from slamdepth.tracking.retry import Retry
 from slamdepth.types import DepthPrediction, Frame, StepResult, TrackingStatus
 
-LOST, RESCUED = TrackingStatus.LOST, TrackingStatus.RESCUED
+LOST, REGISTERED = TrackingStatus.LOST, TrackingStatus.REGISTERED
 BLANK = 60  # two seconds
 
 
@@ -51,11 +51,11 @@ def test_two_seconds_of_black_frames(predicted: bool) -> None:
     assert all(placed(run.results[28 + BLANK :]))
     keyframes = run.results[27].keyframes
     if predicted:
-        assert run.tracker.finish().relocalisations == 1
+        assert run.tracker.finish().statistics.relocalisations == 1
         return
     assert errors_m(run.results)[28:].max() < 0.05
     made = run.finish()
-    assert (made.tracked, made.relocalisations) == (COUNT - 4, 1)
+    assert (made.statistics.tracked, made.statistics.relocalisations) == (COUNT - 4, 1)
     assert len(made.keyframes) >= keyframes  # the old map is still there
 
 
@@ -68,7 +68,7 @@ def test_from_the_middle_to_the_end_and_then_from_the_start() -> None:
     assert jump.status in {TrackingStatus.TRACKING, TrackingStatus.RELOCALISED}
     assert all(placed(run.results))
     assert errors_m(run.results).max() < 0.05
-    assert run.finish().tracked == len(order)
+    assert run.finish().statistics.tracked == len(order)
 
 
 def test_a_white_room_is_tracked_from_first_to_last() -> None:
@@ -95,8 +95,8 @@ def test_a_lost_camera_is_found_by_depth_alone() -> None:
     run = Run(given)
     assert [r.status for r in run.results[21 : 21 + BLANK]] == [LOST] * BLANK
     after = run.results[21 + BLANK :]
-    assert after[0].status in {LOST, RESCUED}  # every third frame is tried
-    assert [r.status for r in after[3:]] == [RESCUED] * 12
+    assert after[0].status in {LOST, REGISTERED}  # every third frame is tried
+    assert [r.status for r in after[3:]] == [REGISTERED] * 12
     assert errors_m(run.results).max() < 0.05
 
 

@@ -22,10 +22,11 @@ from slamdepth.config import Config
 from slamdepth.errors import CameraError
 from slamdepth.geometry import invert, se3_exp, so3_exp, transform
 from slamdepth.mapping.landmarks import MapKeyframe
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.tracking import Tracker, side_thread
 from slamdepth.tracking.keyframes import Moved
 from slamdepth.tracking.threads import single_threaded
-from slamdepth.types import DepthPrediction, Frame, Reconstruction, TrackingStatus
+from slamdepth.types import DepthPrediction, Frame, TrackingStatus
 
 
 class LateDepth(ConstantDepth):

@@ -56,7 +56,7 @@ def test_it_starts_with_the_first_usable_frame(spoil: Change) -> None:
     assert [r.status for r in run.results] == [INITIALISING] * 4 + [TRACKING] * 21
     assert all(r.T_world_camera is None for r in run.results[:4])
     made = run.finish()
-    assert (made.frames, made.tracked) == (25, 21)
+    assert (made.statistics.frames, made.statistics.tracked) == (25, 21)
     assert made.keyframes[0].frame.index == 4
     assert ate_m(made.trajectory) < 0.012
 
@@ -84,7 +84,8 @@ def test_a_hand_over_the_lens(predicted: bool) -> None:
     assert [k.frame.index for k in made.keyframes[:before]] == [
         r.index for r in run.results[:30] if r.is_keyframe
     ]
-    assert (made.frames, made.tracked, made.relocalisations) == (COUNT, COUNT - 15, 1)
+    done = made.statistics
+    assert (done.frames, done.tracked, done.relocalisations) == (COUNT, COUNT - 15, 1)
     assert ate_m(made.trajectory, with_scale=predicted) < (0.025 if predicted else 0.02)
     if not predicted:
         assert position_errors_m(made.trajectory)[-10:].max() < 0.05
@@ -93,12 +94,12 @@ def test_a_hand_over_the_lens(predicted: bool) -> None:
 def test_dark_frames_are_placed_by_their_depth() -> None:
     run = Run(frames(range(50), between(30, 34, dark)))
     for index in range(30, 35):
-        assert run.status_of(index) in {TRACKING, TrackingStatus.RESCUED}
-    assert run.statuses()[TrackingStatus.RESCUED] >= 3
+        assert run.status_of(index) in {TRACKING, TrackingStatus.REGISTERED}
+    assert run.statuses()[TrackingStatus.REGISTERED] >= 3
     online = {r.index: r.T_world_camera for r in run.results}
     made = run.finish()
-    assert made.tracked == 50
-    assert made.rescues == run.statuses()[TrackingStatus.RESCUED]
+    assert made.statistics.tracked == 50
+    assert made.statistics.registrations == run.statuses()[TrackingStatus.REGISTERED]
     errors = position_errors_m(made.trajectory)
     assert errors[30:35].max() < 0.03
     assert all(T is not None for T in online.values())
@@ -109,7 +110,7 @@ def test_frames_without_a_feature_before_a_rolling_shutter() -> None:
     """Nothing tells how far away a pixel is where the frame before was placed by its depth alone."""
     config = Config.from_dict({"shutter": {"readout_ms": 20}})
     run = Run(frames(range(40), between(30, 33, grey)), config=config)
-    assert run.status_of(31) is TrackingStatus.RESCUED
+    assert run.status_of(31) is TrackingStatus.REGISTERED
     assert len(run.finish().trajectory) == 40
 
 
@@ -121,14 +122,14 @@ def test_after_dark_frames_the_map_grows_again() -> None:
 
 
 def test_standing_before_a_white_wall_is_no_reason_for_keyframes() -> None:
-    """Depth goes on, so frames are rescued; but where the view stays the same one keyframe will do."""
+    """Depth goes on, so frames are registered; but where the view stays the same one keyframe will do."""
     given = frames(range(21))
     last = given[-1]
     given += [
         replace(grey(last), index=20 + i, timestamp_s=last.timestamp_s + 0.03 * i) for i in range(1, 13)
     ]
     run = Run(given)
-    assert [r.status for r in run.results[21:]] == [TrackingStatus.RESCUED] * 12
+    assert [r.status for r in run.results[21:]] == [TrackingStatus.REGISTERED] * 12
     assert run.results[-1].keyframes <= run.results[20].keyframes + 2
     poses = np.stack([r.T_world_camera for r in run.results[20:]])
     assert np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max() < 0.02

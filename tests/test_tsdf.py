@@ -10,10 +10,13 @@ import pytest
 
 from slamdepth.config import MapConfig
 from slamdepth.depth.alignment import as_given
+from slamdepth.errors import ConfigError
 from slamdepth.geometry import invert, se3_exp
 from slamdepth.mapping.fusion_depth import View, consistent_pixels, trusted_depth
+from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapping.tsdf import fuse_keyframes
-from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Keyframe
+from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Trajectory
 
 CAMERA = Camera(160, 120, 130.0, 132.0, 80.3, 59.1)
 DISTORTED = replace(CAMERA, distortion=(-0.20, 0.05, -0.004, 0.003, 0.0))
@@ -199,3 +202,29 @@ def test_nothing_to_fuse_is_an_empty_mesh_with_a_note() -> None:
     assert "no keyframe has depth" in blank.notes[0]
     too_small = fuse_keyframes([kf], MapConfig(voxel_size_m=0.1, min_component_triangles=10**6))
     assert "min_component_triangles" in too_small.notes[0]
+
+
+def reconstruction() -> Reconstruction:
+    keyframes = tuple(keyframe(k, CAMERA, T) for k, T in enumerate(poses()))
+    return Reconstruction(Trajectory(np.arange(5.0), np.stack(poses())), keyframes, np.zeros((0, 3)))
+
+
+def test_a_reconstruction_fuses_the_mesh_of_its_keyframes() -> None:
+    calls = []
+    mesh = reconstruction().fuse_mesh(
+        SETTINGS.voxel_size_m,
+        min_component_triangles=SETTINGS.min_component_triangles,
+        progress=lambda *a: calls.append(a),
+    )
+    expected = fuse_keyframes(reconstruction().keyframes, SETTINGS)
+    np.testing.assert_array_equal(mesh.vertices_m, expected.vertices_m)
+    np.testing.assert_array_equal(mesh.triangles, expected.triangles)
+    assert calls[-1] == (5, 5)
+    near = reconstruction().fuse_mesh(max_depth_m=1.9)
+    assert 0 < near.vertices_m[:, 2].max() < WALL_Z - 0.05
+
+
+@pytest.mark.parametrize("wrong", [{"voxel_size_m": 0.0}, {"max_depth_m": -1.0}])
+def test_fusing_with_a_setting_out_of_range_is_a_config_error(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        reconstruction().fuse_mesh(**wrong)

@@ -18,13 +18,13 @@ from slamdepth.depth import registry
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.geometry import invert, umeyama
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.synth.sequence import SynthSettings, render_frames, synth_camera
 from slamdepth.tracking import create_tracker
 from slamdepth.types import (
     DepthKind,
     DepthPrediction,
     Frame,
-    Reconstruction,
     StepResult,
     TrackingStatus,
     Trajectory,

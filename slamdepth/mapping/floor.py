@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.mapping.fusion_depth import View, trusted_depth
+from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.tsdf import undistorted_depth
-from slamdepth.types import Keyframe
 from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
@@ -81,17 +81,17 @@ class _Upright:
 
 
 def find_floor(
-    keyframes: Sequence[Keyframe], max_depth_m: float, *, down_w: Floats | None = None, seed: int = 0
+    keyframes: Sequence[Keyframe], max_depth_m: float, *, gravity_w: Floats | None = None, seed: int = 0
 ) -> Floor | None:
     """The floor below the first camera, or None where no large level surface is found there.
 
     Args:
         keyframes: in order of time; the world is the first camera.
         max_depth_m: depth beyond is not used.
-        down_w: unit direction of gravity ``(3,)`` in the world; None where it is not known.
+        gravity_w: unit direction of gravity ``(3,)`` in the world; None where it is not known.
     """
-    down = np.array([0.0, 1.0, 0.0]) if down_w is None else down_w
-    max_tilt_deg = MAX_TILT_DEG if down_w is None else _KNOWN_TILT_DEG
+    down = np.array([0.0, 1.0, 0.0]) if gravity_w is None else gravity_w
+    max_tilt_deg = MAX_TILT_DEG if gravity_w is None else _KNOWN_TILT_DEG
     chosen = np.unique(np.linspace(0, len(keyframes) - 1, min(len(keyframes), _MAX_KEYFRAMES)).astype(int))
     clouds = [_points_and_normals(keyframes[i], max_depth_m) for i in chosen]
     if not clouds or not (total := sum(len(points) for points, _ in clouds)):

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.geometry import backproject, invert, project, transform
-from slamdepth.types import Camera, Keyframe
+from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.types import Camera
 from slamdepth.typing import Floats32
 
 if TYPE_CHECKING:

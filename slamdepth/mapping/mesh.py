@@ -17,18 +17,16 @@ from slamdepth.io import encode_ply, replacing
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-MESH_ENDINGS = (".ply", ".obj", ".glb")
-
 
 @dataclass(frozen=True)
-class TriangleMesh:
+class Mesh:
     """A mesh in the world frame.
 
     Attributes:
         vertices_m: ``(V, 3)`` float32 metres of the map.
         triangles: ``(T, 3)`` int32 vertex numbers, counter-clockwise seen from outside.
         colors: ``(V, 3)`` float32 sRGB, 0 to 1.
-        notes: what was guessed or cut while it was made, one line each.
+        notes: what was limited or left out when it was made, one line each.
     """
 
     vertices_m: NDArray[np.float32]
@@ -48,49 +46,39 @@ class TriangleMesh:
             raise ValueError(f"a triangle names a vertex outside 0 to {count - 1}")
 
     @classmethod
-    def empty(cls, *notes: str) -> TriangleMesh:
-        """A mesh of nothing."""
+    def empty(cls, *notes: str) -> Mesh:
+        """A mesh without vertices."""
         none = np.zeros((0, 3), np.float32)
         return cls(none, np.zeros((0, 3), np.int32), none, notes)
 
+    def save(self, path: str | Path) -> None:
+        """Write the mesh as binary PLY, OBJ or GLB, by the ending of ``path``.
 
-def check_mesh_path(path: str | Path) -> None:
-    """Tell early whether :func:`write_mesh` knows the ending of ``path``.
+        The file is written whole or not at all. PLY and OBJ keep the world frame (y down when the first
+        camera is level). GLB viewers expect y up, so its scene node turns the mesh by 180 degrees about x.
+        OBJ has the colours after the positions, as MeshLab and Open3D read them.
 
-    Raises:
-        OutputError: it does not; lists those it knows.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in MESH_ENDINGS:
-        raise OutputError(f"{path}: a mesh file must end in one of {', '.join(MESH_ENDINGS)}")
-
-
-def write_mesh(path: str | Path, mesh: TriangleMesh) -> None:
-    """Write a mesh as binary PLY, OBJ (colours behind the positions) or GLB, by the ending of ``path``.
-
-    The file is written whole or not at all. PLY and OBJ keep the world frame (y down when the
-    first camera is level); GLB, whose viewers expect y up, is turned by its scene node.
-
-    Raises:
-        OutputError: an ending other than these, or ``path`` cannot be written.
-    """
-    path = Path(path)
-    check_mesh_path(path)
-    encode = {".ply": _ply, ".obj": _obj, ".glb": _glb}[path.suffix.lower()]
-    data = encode(mesh)
-    with replacing(path) as temporary:
-        temporary.write_bytes(data)
+        Raises:
+            OutputError: the ending is none of these, or ``path`` cannot be written.
+        """
+        path = Path(path)
+        encode = _ENCODERS.get(path.suffix.lower())
+        if encode is None:
+            raise OutputError(f"{path}: a mesh file must end in one of {', '.join(_ENCODERS)}")
+        data = encode(self)
+        with replacing(path) as temporary:
+            temporary.write_bytes(data)
 
 
 def _bytes_of(colors: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.round(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def _ply(mesh: TriangleMesh) -> bytes:
+def _ply(mesh: Mesh) -> bytes:
     return encode_ply(mesh.vertices_m, _bytes_of(mesh.colors), mesh.triangles)
 
 
-def _obj(mesh: TriangleMesh) -> bytes:
+def _obj(mesh: Mesh) -> bytes:
     colors = _bytes_of(mesh.colors) / 255.0
     lines = ["# vertices: x y z r g b"]
     lines += [
@@ -101,7 +89,7 @@ def _obj(mesh: TriangleMesh) -> bytes:
     return ("\n".join(lines) + "\n").encode("ascii")
 
 
-def _glb(mesh: TriangleMesh) -> bytes:
+def _glb(mesh: Mesh) -> bytes:
     """Binary glTF 2.0: one primitive with vertex colours, shown unlit."""
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "slamdepth"}, "scene": 0}
     binary = b""
@@ -164,3 +152,6 @@ def _glb(mesh: TriangleMesh) -> bytes:
     if binary:
         chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+_ENCODERS = {".ply": _ply, ".obj": _obj, ".glb": _glb}

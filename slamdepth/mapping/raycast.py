@@ -13,7 +13,7 @@ from slamdepth.typing import Floats, Floats32
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from slamdepth.mapping.mesh import TriangleMesh
+    from slamdepth.mapping.mesh import Mesh
     from slamdepth.types import Camera
 
 
@@ -23,7 +23,7 @@ _SAMPLES = 2  # rays across a pixel, and down it
 
 
 def render_mesh(
-    mesh: TriangleMesh, camera: Camera, T_world_camera: Floats, background: tuple[int, int, int]
+    mesh: Mesh, camera: Camera, T_world_camera: Floats, background: tuple[int, int, int]
 ) -> NDArray[np.uint8]:
     """``(H, W, 3)`` RGB picture of ``mesh`` as an ideal camera sees it.
 
@@ -66,7 +66,7 @@ def render_mesh(
     return np.round(np.clip(shown, 0.0, 1.0) * 255).astype(np.uint8)
 
 
-def _faces(mesh: TriangleMesh, eye_w: Floats) -> NDArray[np.bool_]:
+def _faces(mesh: Mesh, eye_w: Floats) -> NDArray[np.bool_]:
     """Which triangles show their front to ``eye_w (3,)``."""
     a, b, c = (mesh.vertices_m[mesh.triangles[:, k]] for k in range(3))
     towards = eye_w.astype(np.float32) - a

@@ -16,9 +16,10 @@ import numpy as np
 from slamdepth.config import MapConfig
 from slamdepth.geometry import invert
 from slamdepth.mapping.fusion_depth import View, consistent_pixels, trusted_depth
-from slamdepth.mapping.mesh import TriangleMesh
+from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.mesh import Mesh
 from slamdepth.open3d_loader import import_open3d
-from slamdepth.types import Camera, Keyframe
+from slamdepth.types import Camera
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,7 +39,7 @@ def fuse_keyframes(
     progress: Callable[[int, int], None] | None = None,
     *,
     max_blocks: int = _MAX_BLOCKS,
-) -> TriangleMesh:
+) -> Mesh:
     """Fuse the keyframes' depth and colour; returns the surface in the world frame.
 
     Images and depth are undistorted here. Predicted depth is held to more than measured: what
@@ -57,7 +58,7 @@ def fuse_keyframes(
     """
     keyframes = [kf for kf in keyframes if np.isfinite(kf.T_world_camera).all()]
     if not keyframes:
-        return TriangleMesh.empty("no mesh: there are no keyframes")
+        return Mesh.empty("no mesh: there are no keyframes")
     keep = _consistent(keyframes, settings)
     notes: list[str] = []
     voxel_m = settings.voxel_size_m
@@ -68,14 +69,14 @@ def fuse_keyframes(
         ]
         logger.info(notes[0])
     if grid.hashmap().size() == 0:
-        return TriangleMesh.empty(*notes, "no mesh: no keyframe has depth within the limits")
+        return Mesh.empty(*notes, "no mesh: no keyframe has depth within the limits")
 
     # With few keyframes there is no second view to ask for.
     is_predicted = not any(keyframe.prediction.is_sensor for keyframe in keyframes)
     least_views = 2 if is_predicted and len(keyframes) > 3 else 1
     raw = grid.extract_triangle_mesh(least_views - 0.5)
     if "indices" not in raw.triangle or len(raw.triangle.indices) == 0:
-        return TriangleMesh.empty(*notes, "no mesh: the fused depth holds no surface")
+        return Mesh.empty(*notes, "no mesh: the fused depth holds no surface")
     vertices, triangles, colors = _without_specks(
         raw.vertex.positions.numpy(),
         raw.triangle.indices.numpy(),
@@ -83,13 +84,13 @@ def fuse_keyframes(
         settings.min_component_triangles,
     )
     if len(triangles) == 0:
-        return TriangleMesh.empty(
+        return Mesh.empty(
             *notes,
             f"no mesh: no connected piece has {settings.min_component_triangles} triangles; "
             "lower map.min_component_triangles",
         )
     vertices, triangles, colors = _ordered(vertices, triangles, colors)
-    return TriangleMesh(vertices, triangles, np.clip(colors, 0.0, 1.0), tuple(notes))
+    return Mesh(vertices, triangles, np.clip(colors, 0.0, 1.0), tuple(notes))
 
 
 def _consistent(keyframes: Sequence[Keyframe], settings: MapConfig) -> list[NDArray[np.bool_] | None]:

@@ -14,8 +14,10 @@ from slamdepth.evaluation import score_trajectory
 from slamdepth.evaluation.bootstrap import block_resamples
 from slamdepth.geometry import umeyama
 from slamdepth.mapping.floor import MAX_TILT_DEG, find_floor
+from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report import ScaleSource
-from slamdepth.types import Frame, Keyframe, Reconstruction, Trajectory
+from slamdepth.types import Frame, Trajectory
 from slamdepth.typing import Floats
 
 HEIGHT_SIGMA_LOG = 0.03
@@ -62,7 +64,10 @@ def rescaled(reconstruction: Reconstruction, factor: float) -> Reconstruction:
         ),
         keyframes=tuple(keyframe.rescaled(factor) for keyframe in reconstruction.keyframes),
         points_m=reconstruction.points_m * factor,
-        scale_votes=tuple(vote + math.log(factor) for vote in reconstruction.scale_votes),
+        statistics=replace(
+            reconstruction.statistics,
+            scale_votes=tuple(vote + math.log(factor) for vote in reconstruction.statistics.scale_votes),
+        ),
     )
 
 
@@ -85,22 +90,22 @@ def fused(estimates: Sequence[ScaleEstimate]) -> tuple[float, float, tuple[float
 
 
 def from_camera_height(
-    keyframes: Sequence[Keyframe], height_m: float, max_depth_m: float, down_w: Floats | None = None
+    keyframes: Sequence[Keyframe], height_m: float, max_depth_m: float, gravity_w: Floats | None = None
 ) -> ScaleEstimate:
     """Compare the first camera's known height with that over the floor of the map.
 
     Args:
         max_depth_m: depth beyond is not used.
-        down_w: direction of gravity ``(3,)`` in the world, where it is known.
+        gravity_w: direction of gravity ``(3,)`` in the world, where it is known.
 
     Raises:
         DatasetError: no floor is found.
     """
-    floor = find_floor(keyframes, max_depth_m, down_w=down_w)
+    floor = find_floor(keyframes, max_depth_m, gravity_w=gravity_w)
     if floor is None:
-        held = f", the first camera upright to within {MAX_TILT_DEG:g} degrees" if down_w is None else ""
+        held = f", the first camera upright to within {MAX_TILT_DEG:g} degrees" if gravity_w is None else ""
         raise DatasetError(f"no floor was found below the first camera (a large level surface{held})")
-    level = "the first camera's y axis" if down_w is None else "level, by gravity as the images tell it"
+    level = "the first camera's y axis" if gravity_w is None else "level, by gravity as the images tell it"
     how = (
         f"a camera height of {height_m:g} m against {floor.height:.2f} m over the lowest large level "
         f"surface, which {floor.keyframes} keyframes see, {floor.tilt_deg:.0f} degrees from {level}"

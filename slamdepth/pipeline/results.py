@@ -12,9 +12,11 @@ from slamdepth.config import Config
 from slamdepth.datasets import Dataset
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.evaluation import DepthScore, DepthScorer, TrajectoryScore, score_trajectory
+from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, Stage
 from slamdepth.report import MeshCounts, MeshPicture, mesh_pictures
-from slamdepth.types import DepthKind, Keyframe, Reconstruction, Trajectory
+from slamdepth.types import DepthKind, Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -43,16 +45,19 @@ def write_keyframe_mesh(
     Raises:
         OutputError: ``path`` cannot be written.
     """
-    from slamdepth.mapping.mesh import write_mesh
-    from slamdepth.mapping.tsdf import fuse_keyframes
 
     def tell(done: int, total: int) -> None:
         progress(RunProgress(Stage.MESHING, done, total))
 
-    mesh = fuse_keyframes(reconstruction.keyframes, config.map, tell)
+    mesh = reconstruction.fuse_mesh(
+        config.map.voxel_size_m,
+        max_depth_m=config.map.max_depth_m,
+        min_component_triangles=config.map.min_component_triangles,
+        progress=tell,
+    )
     if len(mesh.triangles) == 0:
         return None, (), mesh.notes
-    write_mesh(path, mesh)
+    mesh.save(path)
     counts = MeshCounts(len(mesh.vertices_m), len(mesh.triangles))
     return counts, mesh_pictures(mesh, reconstruction), mesh.notes
 

@@ -17,6 +17,7 @@ import numpy as np
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset
 from slamdepth.errors import DatasetError
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.known_size import (
     ScaleEstimate,
     from_baseline,
@@ -28,7 +29,6 @@ from slamdepth.pipeline.known_size import (
 )
 from slamdepth.pipeline.prediction_scale import PredictionScale, read_with_depth
 from slamdepth.report import ScaleFacts, ScalePart, ScaleSource
-from slamdepth.types import Reconstruction
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ def settle_scale(
     dataset: Dataset, reconstruction: Reconstruction, before: PredictionScale, config: Config
 ) -> tuple[Reconstruction, ScaleFacts, tuple[str, ...]]:
     """The reconstruction at its final scale, the facts about it, and notes on what failed."""
-    votes = np.array(reconstruction.scale_votes)
+    votes = np.array(reconstruction.statistics.scale_votes)
     spread = float(np.std(votes)) if len(votes) else None
     own = ScaleEstimate(before.source, 1.0, before.sigma_log, before.how)
     if spread is not None:
@@ -121,7 +121,7 @@ def _known_sizes(
             (
                 "from the camera height",
                 lambda: from_camera_height(
-                    reconstruction.keyframes, height_m, reach_m, reconstruction.down_w
+                    reconstruction.keyframes, height_m, reach_m, reconstruction.gravity_w
                 ),
             )
         )

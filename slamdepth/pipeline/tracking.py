@@ -14,9 +14,10 @@ from typing import Any, Protocol
 from slamdepth.datasets import Dataset
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import TrajectoryWriter
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.options import ProgressCallback, RunInterrupted, RunProgress, Stage
 from slamdepth.pipeline.prefetch import FramePrefetcher
-from slamdepth.types import Frame, Reconstruction, StepResult
+from slamdepth.types import Frame, StepResult
 
 logger = logging.getLogger(__name__)
 
@@ -106,9 +107,10 @@ def track(
     progress(replace(state, stage=Stage.OPTIMISING))
     finish_s = time.perf_counter()
     reconstruction = tracker.finish()
+    statistics = reconstruction.statistics
     end_s = time.perf_counter()
     timings_ms = {
-        **reconstruction.timings_ms,
+        **statistics.timings_ms,
         "finish": 1e3 * (end_s - finish_s),
         "decode": 1e3 * reader.read_s / max(1, len(steps)),
     }
@@ -124,8 +126,11 @@ def track(
     return Tracked(
         replace(
             reconstruction,
-            timings_ms=timings_ms,
-            timing_calls={**reconstruction.timing_calls, "finish": 1, "decode": len(steps)},
+            statistics=replace(
+                statistics,
+                timings_ms=timings_ms,
+                timing_calls={**statistics.timing_calls, "finish": 1, "decode": len(steps)},
+            ),
         ),
         tuple(steps),
         len(steps) / (end_s - start_s),

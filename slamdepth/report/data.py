@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 from slamdepth.config import Config
 from slamdepth.evaluation import DepthScore, TrajectoryScore
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report.mesh_images import MeshPicture
 from slamdepth.report.scale import ScaleFacts
-from slamdepth.types import Reconstruction, StepResult, WeightsInfo
+from slamdepth.types import StepResult, WeightsInfo
 
 
 @dataclass(frozen=True)

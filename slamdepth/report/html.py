@@ -102,7 +102,7 @@ def _trajectory(data: ReportData, summary: dict[str, Any]) -> str:
     score = data.trajectory_score
     body = plot(
         plots.trajectory_plot(data.reconstruction, score),
-        f"The path after optimisation. {about_views(data.reconstruction.down_w)}"
+        f"The path after optimisation. {about_views(data.reconstruction.gravity_w)}"
         + (" Thin lines join each pose to its ground truth, aligned by SE(3)." if score else ""),
     )
     if score is None:
@@ -156,7 +156,7 @@ def _tracking(data: ReportData, summary: dict[str, Any]) -> str:
         ["keyframes", count(summary["keyframes"])],
         ["loop closures", count(summary["loop_closures"])],
         ["relocalisations after loss", count(summary["relocalisations"])],
-        ["rescues by point-cloud registration", count(summary["rescues"])],
+        ["frames placed by point-cloud registration", count(summary["registrations"])],
         ["rolling shutter", summary["rolling_shutter"]["sentence"]],
     ]
     strip = plot(
@@ -232,7 +232,7 @@ def _map(data: ReportData, summary: dict[str, Any]) -> str:
     chart = plot(
         plots.map_plot(data.reconstruction),
         "Sparse points (grey), the path, and the keyframes as dots. "
-        + about_views(data.reconstruction.down_w),
+        + about_views(data.reconstruction.gravity_w),
     )
     return section("Map", intro, chart + _mesh(data) + table([], rows))
 

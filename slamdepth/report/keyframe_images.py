@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from slamdepth.types import Keyframe
+    from slamdepth.mapping.keyframe import Keyframe
 
 NEAR_TO_FAR = ("#0b1457", "#17458f", "#11787f", "#2f9e4f", "#98c83a", "#fbe743")
 """Depth from near (dark blue) over green to far (yellow), evenly spaced."""

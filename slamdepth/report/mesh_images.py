@@ -18,8 +18,9 @@ from slamdepth.report.viewpoints import from_above, guessed_down, over_the_shoul
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from slamdepth.mapping.mesh import TriangleMesh
-    from slamdepth.types import Camera, Reconstruction, Trajectory
+    from slamdepth.mapping.mesh import Mesh
+    from slamdepth.mapping.reconstruction import Reconstruction
+    from slamdepth.types import Camera, Trajectory
 
 _WIDTH, _HEIGHT = 900, 600
 _BACKGROUND = (205, 211, 219)
@@ -43,7 +44,7 @@ class MeshPicture:
     image_rgb: NDArray[np.uint8]
 
 
-def mesh_pictures(mesh: TriangleMesh, run: Reconstruction) -> tuple[MeshPicture, ...]:
+def mesh_pictures(mesh: Mesh, run: Reconstruction) -> tuple[MeshPicture, ...]:
     """Views of ``mesh``, none where it has no triangle or ``run`` no pose.
 
     Up is against gravity where ``run`` knows it, else guessed from how the camera was held; a picture
@@ -55,10 +56,10 @@ def mesh_pictures(mesh: TriangleMesh, run: Reconstruction) -> tuple[MeshPicture,
     poses = run.trajectory.T_world_camera
     if len(mesh.triangles) == 0 or len(poses) == 0:
         return ()
-    down_w = guessed_down(poses) if run.down_w is None else run.down_w
+    down_w = guessed_down(poses) if run.gravity_w is None else run.gravity_w
     level = (
         "upright by gravity"
-        if run.down_w is not None
+        if run.gravity_w is not None
         else "which way is up is guessed from how the camera was held"
     )
     wide = picture_camera(_WIDTH, _HEIGHT, 50.0)

@@ -18,8 +18,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from slamdepth.evaluation import RelativeError, TrajectoryScore
+    from slamdepth.mapping.keyframe import Keyframe
+    from slamdepth.mapping.reconstruction import Reconstruction
     from slamdepth.report.axes import View
-    from slamdepth.types import Keyframe, Reconstruction, StepResult
+    from slamdepth.types import StepResult
 
 
 _WIDTH = 9.6
@@ -31,7 +33,7 @@ _STATUS_COLOURS = {
     TrackingStatus.INITIALISING: fig.MUTED,
     TrackingStatus.TRACKING: fig.GOOD,
     TrackingStatus.RELOCALISED: fig.ESTIMATE,
-    TrackingStatus.RESCUED: fig.WARN,
+    TrackingStatus.REGISTERED: fig.WARN,
     TrackingStatus.LOST: fig.BAD,
 }
 
@@ -55,7 +57,7 @@ def trajectory_plot(run: Reconstruction, score: TrajectoryScore | None) -> str |
         ends = np.stack([truth, score.estimate_m, np.full_like(truth, np.nan)], axis=1)[::step]
         links = ends.reshape(-1, 3)
 
-    views = drawing_views(run.down_w)
+    views = drawing_views(run.gravity_w)
     with fig.styled("trajectory"):
         figure, axes = fig.new_figure(_WIDTH, 4.6, 1, 2)
         for panel, view in zip(axes[0], views, strict=True):
@@ -81,7 +83,7 @@ def map_plot(run: Reconstruction) -> str | None:
     path = run.trajectory.T_world_camera[:, :3, 3]
     broken = _with_gaps(run.trajectory.timestamps_s, path)
     places = np.array([keyframe.T_world_camera[:3, 3] for keyframe in run.keyframes]).reshape(-1, 3)
-    views = drawing_views(run.down_w)
+    views = drawing_views(run.gravity_w)
     with fig.styled("map"):
         figure, axes = fig.new_figure(_WIDTH, 4.4, 1, 2)
         for panel, view in zip(axes[0], views, strict=True):

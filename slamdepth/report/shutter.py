@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from slamdepth.types import Reconstruction
+from slamdepth.types import RunStatistics
 
 
-def shutter_facts(run: Reconstruction, is_given: bool) -> dict[str, Any]:
+def shutter_facts(run: RunStatistics, is_given: bool) -> dict[str, Any]:
     """Readout time and its deviation in milliseconds, whether it was found out, and a sentence."""
     if run.readout_s is None:
         return {

@@ -14,25 +14,25 @@ from slamdepth.report.shutter import shutter_facts
 
 def build_summary(data: ReportData) -> dict[str, Any]:
     """Every key is always there; what could not be measured is None."""
-    run = data.reconstruction
+    run, statistics = data.reconstruction, data.reconstruction.statistics
     return {
         "sequence": data.sequence,
         "depth_model": data.depth_model,
         "features": data.config.features.name if data.config.odometry == "orb" else None,
         "scale": data.scale.to_dict(),
-        "frames": run.frames,
-        "tracked": run.tracked,
-        "tracked_fraction": run.tracked / run.frames if run.frames else None,
+        "frames": statistics.frames,
+        "tracked": statistics.tracked,
+        "tracked_fraction": statistics.tracked / statistics.frames if statistics.frames else None,
         "skipped_frames": data.skipped_frames,
         "keyframes": len(run.keyframes),
-        "loop_closures": run.loop_closures,
-        "relocalisations": run.relocalisations,
-        "rescues": run.rescues,
+        "loop_closures": statistics.loop_closures,
+        "relocalisations": statistics.relocalisations,
+        "registrations": statistics.registrations,
         "fps": data.fps,
-        "rolling_shutter": shutter_facts(run, data.config.shutter.readout_ms is not None),
-        "timings_ms": dict(run.timings_ms),
-        "timing_calls": dict(run.timing_calls),
-        "wall_s": run.frames / data.fps if data.fps > 0 else None,
+        "rolling_shutter": shutter_facts(statistics, data.config.shutter.readout_ms is not None),
+        "timings_ms": dict(statistics.timings_ms),
+        "timing_calls": dict(statistics.timing_calls),
+        "wall_s": statistics.frames / data.fps if data.fps > 0 else None,
         **_trajectory(data.trajectory_score),
         "depth": _depth(data.depth_score),
         "mesh": {

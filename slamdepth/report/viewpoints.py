@@ -15,7 +15,7 @@ from slamdepth.typing import Floats
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from slamdepth.mapping.mesh import TriangleMesh
+    from slamdepth.mapping.mesh import Mesh
 
 
 _ELEVATION = math.radians(35.0)
@@ -52,7 +52,7 @@ def guessed_down(T_world_camera: Floats) -> Floats:
     return np.asarray(down if is_level else y)
 
 
-def from_above(mesh: TriangleMesh, path_w: Floats, down_w: Floats, camera: Camera) -> Floats:
+def from_above(mesh: Mesh, path_w: Floats, down_w: Floats, camera: Camera) -> Floats:
     """``T_world_camera (4, 4)`` obliquely from above, from the side that shows most of the mesh's front.
 
     That is behind the camera which saw it. Mesh and path are in the picture as a whole, strays apart.
@@ -70,9 +70,7 @@ def from_above(mesh: TriangleMesh, path_w: Floats, down_w: Floats, camera: Camer
     return _fitted(corner, path_w, look_at(np.zeros(3), ahead[int(shown.argmax())], down), camera)
 
 
-def over_the_shoulder(
-    mesh: TriangleMesh, T_world_camera: Floats, down_w: Floats, camera: Camera
-) -> Floats | None:
+def over_the_shoulder(mesh: Mesh, T_world_camera: Floats, down_w: Floats, camera: Camera) -> Floats | None:
     """``T_world_camera (4, 4)`` a step behind that pose ``(N, 4, 4)`` of the path from which most of the
     mesh's front is seen; None where each looks straight down or up, or at nothing.
 
@@ -110,7 +108,7 @@ def look_at(eye_w: Floats, target_w: Floats, down_w: Floats) -> Floats:
     return T
 
 
-def _triangles(mesh: TriangleMesh) -> tuple[Floats, Floats]:
+def _triangles(mesh: Mesh) -> tuple[Floats, Floats]:
     """A corner ``(N, 3)`` of some triangles, and their normals as long as twice their area."""
     some = mesh.triangles[:: -(-len(mesh.triangles) // _MOST)]
     a, b, c = (mesh.vertices_m[some[:, k]].astype(np.float64) for k in range(3))

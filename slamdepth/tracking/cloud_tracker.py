@@ -15,15 +15,16 @@ from slamdepth.depth.base import DepthModel
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.registration import CloudOdometry, CloudOdometryConfig, depth_to_cloud
 from slamdepth.geometry import invert, project, transform
+from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.keyframe_store import KeyframeStore
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.tracking.checks import check_frame, model_for
 from slamdepth.tracking.threads import single_threaded
 from slamdepth.types import (
     Camera,
     DepthPrediction,
     Frame,
-    Keyframe,
-    Reconstruction,
+    RunStatistics,
     StepResult,
     TrackingStatus,
     Trajectory,
@@ -156,11 +157,10 @@ class CloudTracker:
             trajectory=Trajectory(np.array(self._times), np.stack(self._poses)),
             keyframes=tuple(kept.final(i) for i, kept in enumerate(self._keyframes)),
             points_m=self._odometry.local_map_w,
-            frames=self._frames,
-            tracked=len(self._poses),
-            loop_closures=0,
-            relocalisations=0,
-            rescues=0,
-            timings_ms={stage: float(np.mean(values)) for stage, values in self._totals.items()},
-            timing_calls={stage: len(values) for stage, values in self._totals.items()},
+            statistics=RunStatistics(
+                frames=self._frames,
+                tracked=len(self._poses),
+                timings_ms={stage: float(np.mean(values)) for stage, values in self._totals.items()},
+                timing_calls={stage: len(values) for stage, values in self._totals.items()},
+            ),
         )

@@ -96,7 +96,7 @@ class Finder:
             self._motion.last = None
             return placement, TrackingStatus.RELOCALISED
         placement = self._rescued(frame, features)
-        return placement, TrackingStatus.LOST if placement is None else TrackingStatus.RESCUED
+        return placement, TrackingStatus.LOST if placement is None else TrackingStatus.REGISTERED
 
     def _relocalise(self, features: Features) -> Placement | None:
         answers = self._places.query(features.place_descriptors, top_k=_RELOCALISATION_CANDIDATES)

@@ -14,12 +14,14 @@ from slamdepth.config import Config
 from slamdepth.depth.alignment import as_given, coarse_correction, corrected_depth
 from slamdepth.depth.robust_centre import robust_centre
 from slamdepth.geometry import invert
+from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.local_mapper import LocalMapper
 from slamdepth.tracking.map_adjuster import MapAdjuster
 from slamdepth.tracking.shutter import Shutter
-from slamdepth.types import Keyframe, Reconstruction
+from slamdepth.types import RunStatistics
 from slamdepth.typing import Floats
 
 _SEARCHED_AGAIN = 6  # neighbours of each keyframe; twice as many gain nothing measurable
@@ -40,7 +42,7 @@ def optimise_everything(
     """Global bundle adjustment and metric scale.
 
     Returns:
-        Notes, and the keyframes' votes on the scale; see ``Reconstruction.scale_votes``.
+        Notes, and the keyframes' votes on the scale; see ``RunStatistics.scale_votes``.
     """
     notes: list[str] = []
     votes: tuple[float, ...] = ()
@@ -144,12 +146,12 @@ def build_reconstruction(
     frames_total: int,
     loop_closures: int,
     relocalisations: int,
-    rescues: int,
+    registrations: int,
     timings_ms: dict[str, float],
     timing_calls: dict[str, int],
     notes: list[str],
     scale_votes: tuple[float, ...] = (),
-    down_w: Floats | None = None,
+    gravity_w: Floats | None = None,
 ) -> Reconstruction:
     """The value handed to the user, with every frame placed anew where ``refine_frames``."""
     # NumPy and the disk work in other threads while this one places frames
@@ -162,18 +164,20 @@ def build_reconstruction(
         trajectory=frames.trajectory(),
         keyframes=keyframes,
         points_m=landmarks.position_w[landmarks.seen_by(2)],
-        frames=frames_total,
-        tracked=len(frames),
-        loop_closures=loop_closures,
-        relocalisations=relocalisations,
-        rescues=rescues,
-        timings_ms=timings_ms,
-        timing_calls=timing_calls,
+        gravity_w=gravity_w,
         notes=tuple(notes),
-        scale_votes=scale_votes,
-        readout_s=shutter.readout_s,
-        readout_sigma_s=shutter.sigma_s,
-        down_w=down_w,
+        statistics=RunStatistics(
+            frames=frames_total,
+            tracked=len(frames),
+            loop_closures=loop_closures,
+            relocalisations=relocalisations,
+            registrations=registrations,
+            timings_ms=timings_ms,
+            timing_calls=timing_calls,
+            readout_s=shutter.readout_s,
+            readout_sigma_s=shutter.sigma_s,
+            scale_votes=scale_votes,
+        ),
     )
 
 

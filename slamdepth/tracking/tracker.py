@@ -14,6 +14,7 @@ from slamdepth.errors import TrackingError
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import invert
 from slamdepth.mapping.landmarks import LandmarkMap
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.tracking.between_frames import BetweenFrames
 from slamdepth.tracking.checks import check_frame, model_for
 from slamdepth.tracking.depth_thread import DepthThread
@@ -33,14 +34,7 @@ from slamdepth.tracking.shutter import Shutter
 from slamdepth.tracking.side_thread import SideThread
 from slamdepth.tracking.stopwatch import Stopwatch
 from slamdepth.tracking.threads import single_threaded
-from slamdepth.types import (
-    Camera,
-    DepthPrediction,
-    Frame,
-    Reconstruction,
-    StepResult,
-    TrackingStatus,
-)
+from slamdepth.types import Camera, DepthPrediction, Frame, StepResult, TrackingStatus
 
 log = logging.getLogger(__name__)
 
@@ -295,12 +289,12 @@ class Tracker:
                 frames_total=self._frames,
                 loop_closures=self._loops.count,
                 relocalisations=self._finder.relocalisations,
-                rescues=self._finder.rescues,
+                registrations=self._finder.rescues,
                 timings_ms=self._watch.mean_ms(),
                 timing_calls=self._watch.calls(),
                 notes=notes,
                 scale_votes=votes,
-                down_w=self._depth.down_w(),
+                gravity_w=self._depth.down_w(),
             )
             self._depth.close()
             self._side.close()
