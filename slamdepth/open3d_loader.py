@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one door to Open3D.
+"""The only place that imports Open3D.
 
 Open3D's wheels link against ``libusb-1.0.so.0``, which a bare Linux does not have. The
-``libusb-package`` wheel carries that library; loaded into the process beforehand it
-serves Open3D. Elsewhere, and where the system has its own, nothing is preloaded.
+``libusb-package`` wheel carries that library; it is loaded before Open3D. Elsewhere, and where the
+system has its own, nothing is preloaded.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def import_open3d() -> Any:
 
 
 def _preload_libusb() -> None:
-    """Make ``libusb-1.0.so.0`` known to the dynamic linker, if it is to be had at all."""
+    """Load ``libusb-1.0.so.0`` into the process, where one is installed."""
     try:
         ctypes.CDLL(_LIBUSB, mode=ctypes.RTLD_GLOBAL)
         return

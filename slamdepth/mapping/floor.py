@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How high the first camera was over the floor, from the depth of the keyframes.
+"""Height of the first camera over the floor, from the depth of the keyframes.
 
-The floor is a plane below the first camera whose normal is close to gravity, where that is known. Where
-it is not, the first camera is taken to have been held upright to within ``MAX_TILT_DEG``. Of several such
-planes (seats, desks, the floor) the lowest that is large and has next to nothing beneath it is the floor.
+The floor is a plane below the first camera whose normal is close to gravity, where that is known. Where it
+is not, the first camera is assumed to be upright to within ``MAX_TILT_DEG``. Of several such planes (seats,
+desks, the floor) the lowest is taken that is large and has almost no points below it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 MAX_TILT_DEG = 35.0
-_KNOWN_TILT_DEG = 20.0  # predicted floors lean, and gravity as images tell it errs by some degrees
+_KNOWN_TILT_DEG = 20.0  # predicted floors lean, and gravity estimated from images errs by some degrees
 
 _MAX_KEYFRAMES = 40
 _STEP = 2  # of a view 160 pixels wide
@@ -36,7 +36,7 @@ _PLANES = 4
 _MIN_SHARE, _MIN_LEVEL_SHARE = 0.02, 0.1  # of all points, of the level ones, that a floor has at least
 _MIN_POINTS = 200
 _MAX_BENEATH = 0.03  # share of all points that may lie clearly below a floor
-_MIN_HEIGHT = 0.1  # of the median distance: nearer is what the camera stands on or a hand
+_MIN_HEIGHT = 0.1  # of the median distance: nearer is the camera's support or a hand
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ class Floor:
     """A plane below the first camera: ``normal @ p = height`` for points in the world.
 
     Attributes:
-        normal: ``(3,)`` unit vector, down.
-        height: of the first camera over it, in metres of the map.
-        sigma_log: standard error of the log of the height, from how much the heights
-            differ that single keyframes see.
+        normal: ``(3,)`` unit vector along gravity.
+        height: height of the first camera over it, in metres of the map.
+        sigma_log: standard error of the log of the height, from the spread of the heights that single
+            keyframes see.
         tilt_deg: between the normal and gravity, or the first camera's y axis where that is not known.
-        keyframes: that see it.
-        share: of all points that lie on it.
+        keyframes: number of keyframes that see it.
+        share: share of all points that lie on it.
     """
 
     normal: Floats
@@ -63,18 +63,18 @@ class Floor:
 
 @dataclass(frozen=True)
 class _Upright:
-    """What a floor's plane has to be like."""
+    """The planes that may be a floor."""
 
-    down: Floats
+    gravity_w: Floats
     least_cosine: float
     min_height: float
 
     def plane(self, normal: Floats, point: Floats) -> tuple[Floats, float] | None:
-        """Unit normal (down) and height of a plane that may be a floor, else None."""
+        """Unit normal (along gravity) and height of the plane, None where it cannot be a floor."""
         length = float(np.linalg.norm(normal))
         if length < 1e-12:
             return None
-        cosine = float(normal @ self.down) / length
+        cosine = float(normal @ self.gravity_w) / length
         normal = normal / length * (1.0 if cosine > 0 else -1.0)
         height = float(normal @ point)
         return None if abs(cosine) < self.least_cosine or height < self.min_height else (normal, height)
@@ -89,9 +89,10 @@ def find_floor(
         keyframes: in order of time; the world is the first camera.
         max_depth_m: depth beyond is not used.
         gravity_w: unit direction of gravity ``(3,)`` in the world; None where it is not known.
+        seed: of the random trials (RANSAC).
     """
-    down = np.array([0.0, 1.0, 0.0]) if gravity_w is None else gravity_w
     max_tilt_deg = MAX_TILT_DEG if gravity_w is None else _KNOWN_TILT_DEG
+    gravity_w = np.array([0.0, 1.0, 0.0]) if gravity_w is None else gravity_w
     chosen = np.unique(np.linspace(0, len(keyframes) - 1, min(len(keyframes), _MAX_KEYFRAMES)).astype(int))
     clouds = [_points_and_normals(keyframes[i], max_depth_m) for i in chosen]
     if not clouds or not (total := sum(len(points) for points, _ in clouds)):
@@ -101,8 +102,8 @@ def find_floor(
     owner = np.repeat(np.arange(len(clouds)), [len(points) for points, _ in clouds])
     scale = float(np.median(np.linalg.norm(points, axis=1)))
     tolerance = _TOLERANCE * scale
-    level = np.abs(normals @ down) > math.cos(math.radians(max_tilt_deg + _NORMAL_TOLERANCE_DEG))
-    upright = _Upright(down, math.cos(math.radians(max_tilt_deg)), _MIN_HEIGHT * scale)
+    level = np.abs(normals @ gravity_w) > math.cos(math.radians(max_tilt_deg + _NORMAL_TOLERANCE_DEG))
+    upright = _Upright(gravity_w, math.cos(math.radians(max_tilt_deg)), _MIN_HEIGHT * scale)
     rng = np.random.default_rng(seed)
     left = level.copy()
     best: tuple[float, Floats, NDArray[np.bool_]] | None = None
@@ -127,13 +128,13 @@ def find_floor(
         for k in range(len(clouds))
         if np.count_nonzero(mine := on_plane & (owner == k)) >= _MIN_POINTS // 4
     ]
-    # one keyframe's height errs by the tolerance, or by what is seen
+    # at least the tolerance: the heights of few keyframes may agree by chance
     spread = max(float(np.std(heights)) if len(heights) > 1 else 0.0, tolerance)
     return Floor(
         normal=normal,
         height=height,
         sigma_log=spread / height / math.sqrt(max(1, len(heights))),
-        tilt_deg=math.degrees(math.acos(min(1.0, float(normal @ down)))),
+        tilt_deg=math.degrees(math.acos(min(1.0, float(normal @ gravity_w)))),
         keyframes=len(heights),
         share=float(np.mean(on_plane)),
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a mesh by casting rays at it: no graphics card, no window."""
+"""Images of a mesh by ray casting; needs neither a graphics card nor a window."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
     from slamdepth.types import Camera
 
 
-_FLAT = 0.75  # share of the light that comes from everywhere; photographs have shades of their own
+_FLAT = 0.75  # share of ambient light; the colours, taken from photographs, are shaded already
 _GREY, _GREY_FLAT = 0.85, 0.25
-_SAMPLES = 2  # rays across a pixel, and down it
+_SAMPLES = 2  # per pixel and axis
 
 
 def render_mesh(
     mesh: Mesh, camera: Camera, T_world_camera: Floats, background: tuple[int, int, int]
 ) -> NDArray[np.uint8]:
-    """``(H, W, 3)`` RGB picture of ``mesh`` as an ideal camera sees it.
+    """Render ``mesh`` as a pinhole camera sees it: ``(H, W, 3)`` uint8 RGB.
 
-    Triangles that show the camera their back are left out, so one looks into a room through its walls and
-    its ceiling. The light comes from the camera. A mesh whose colours are all black has none and is grey.
+    Back-facing triangles are left out, so that the camera looks into a room through its walls and ceiling.
+    The light comes from the camera. A mesh whose colours are all black is taken to have none and is grey.
 
     Args:
         mesh: in the world frame.
-        camera: size and focal length; distortion is left out.
+        camera: size and intrinsics; distortion is ignored.
         T_world_camera: ``(4, 4)``.
-        background: RGB where nothing is hit.
+        background: RGB, 0 to 255, where no triangle is hit.
 
     Raises:
         SlamdepthError: Open3D is not installed.
@@ -44,7 +44,7 @@ def render_mesh(
     triangles = mesh.triangles[_faces(mesh, T_world_camera[:3, 3])]
     if len(triangles):
         colors = mesh.colors if mesh.colors.any() else None
-        # one thread: what two triangles share is then always given to the same one
+        # one thread: a hit on an edge is then always assigned to the same triangle
         scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         scene.add_triangles(
             o3d.core.Tensor(np.ascontiguousarray(mesh.vertices_m, np.float32)),
@@ -63,18 +63,18 @@ def render_mesh(
             normals, uv = hits["primitive_normals"][is_hit], hits["primitive_uvs"][is_hit]
             sample[is_hit] = _lit(colors, corners, uv, normals, directions[is_hit])
             shown += sample / np.float32(_SAMPLES**2)
-    return np.round(np.clip(shown, 0.0, 1.0) * 255).astype(np.uint8)
+    return np.asarray(np.round(np.clip(shown, 0.0, 1.0) * 255), np.uint8)
 
 
 def _faces(mesh: Mesh, eye_w: Floats) -> NDArray[np.bool_]:
-    """Which triangles show their front to ``eye_w (3,)``."""
+    """Mask ``(T,)`` of the triangles whose front faces ``eye_w (3,)``."""
     a, b, c = (mesh.vertices_m[mesh.triangles[:, k]] for k in range(3))
     towards = eye_w.astype(np.float32) - a
     return np.asarray(np.einsum("ij,ij->i", np.cross(b - a, c - a), towards) > 0)
 
 
 def _directions(camera: Camera, R_world_camera: Floats, dx: float, dy: float) -> NDArray[np.float32]:
-    """Unit directions ``(H, W, 3)`` in the world of rays ``dx``, ``dy`` pixels off the pixels' centres."""
+    """Unit directions ``(H, W, 3)`` in the world of rays ``dx``, ``dy`` pixels off the pixel centres."""
     x = (np.arange(camera.width) + dx - camera.cx) / camera.fx
     y = (np.arange(camera.height) + dy - camera.cy) / camera.fy
     grid = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=-1)
@@ -89,7 +89,7 @@ def _lit(
     normals: NDArray[np.float32],
     directions: NDArray[np.float32],
 ) -> Floats32:
-    """Colours ``(N, 3)`` of hits between the ``corners (N, 3)`` of their triangles."""
+    """Shaded colours ``(N, 3)`` of the hits at ``uv (N, 2)`` on triangles with ``corners (N, 3)``."""
     length = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
     cosine = np.abs(np.einsum("ij,ij->i", normals, directions)) / length
     if colors is None:
