@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from slamdepth.evaluation import score_trajectory
     from slamdepth.io import read_tum_trajectory, write_tum_trajectory
     from slamdepth.mapping.keyframe import Keyframe
+    from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
     from slamdepth.mapping.mesh import Mesh
     from slamdepth.mapping.reconstruction import Reconstruction
     from slamdepth.tracking import Tracker, create_tracker
@@ -65,6 +66,8 @@ _HOME = {
     "RunStatistics": "slamdepth.types",
     "SlamdepthError": "slamdepth.errors",
     "StepResult": "slamdepth.types",
+    "StoredFrame": "slamdepth.mapping.keyframe_store",
+    "StoredPrediction": "slamdepth.mapping.keyframe_store",
     "Tracker": "slamdepth.tracking",
     "TrackingError": "slamdepth.errors",
     "TrackingStatus": "slamdepth.types",
@@ -99,6 +102,8 @@ __all__ = [
     "RunStatistics",
     "SlamdepthError",
     "StepResult",
+    "StoredFrame",
+    "StoredPrediction",
     "Tracker",
     "TrackingError",
     "TrackingStatus",

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes' images put away and taken back, and what a tracker holds in memory."""
+"""Keyframes' images spilled to disk and read back, and the memory a tracker takes."""
 
 from __future__ import annotations
 
 import gc
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +20,16 @@ from numpy.typing import NDArray
 from slamdepth.config import Config
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.mapping import landmarks
-from slamdepth.mapping.keyframe_store import KeyframeStore, NamelessFile, StoredFrame, StoredPrediction
-from slamdepth.mapping.packing import Numbers, pack_image, pack_measured, pack_predicted, unpack_image
+from slamdepth.mapping.codec import Encoded, encode_half_precision, encode_image, encode_sensor_depth
+from slamdepth.mapping.keyframe_store import KeyframeStore, StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.mapping.spill_file import SpillFile
 from slamdepth.pipeline.known_size import rescaled
 from slamdepth.tracking import frame_log
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5, depth_factor=5000.0)
+GRAVITY = np.array([0.0, 0.6, 0.8])
 
 
 def image(seed: int = 0) -> NDArray[np.uint8]:
@@ -42,140 +44,156 @@ def measured(seed: int = 0) -> NDArray[np.float32]:
 
 
 @dataclass
-class Held:
-    frame: Frame
-    prediction: DepthPrediction | None
+class Stored:
+    frame: StoredFrame
+    prediction: StoredPrediction | None
 
 
-def sensor_keyframe(seed: int) -> Held:
+def sensor_keyframe(seed: int) -> Stored:
     frame = Frame(seed, seed / 30.0, image(seed), CAMERA, measured(seed))
-    return Held(frame, replace(SensorDepth().predict(frame), sigma_log=None))
+    prediction = replace(SensorDepth().predict(frame), sigma_log=None)
+    return Stored(StoredFrame(frame), StoredPrediction(prediction))
 
 
-def predicted_keyframe(seed: int) -> Held:
+def predicted_keyframe(seed: int) -> Stored:
     values = (1.0 + np.random.default_rng(seed).random((48, 64))).astype(np.float32)
     sigma = (0.1 * values).astype(np.float16)
-    frame = Frame(seed, seed / 30.0, image(seed), CAMERA)
-    return Held(frame, DepthPrediction(values, DepthKind.METRIC, sigma))
+    frame = Frame(seed, seed / 30.0, image(seed), CAMERA, gravity=GRAVITY)
+    prediction = DepthPrediction(values, DepthKind.METRIC, sigma, gravity=GRAVITY, gravity_share=0.7)
+    return Stored(StoredFrame(frame), StoredPrediction(prediction))
+
+
+def decoded(encoded: Encoded) -> NDArray[Any]:
+    return encoded.decode(encoded.data)
 
 
 @given(
     arrays.arrays(np.uint16, arrays.array_shapes(min_dims=2, max_dims=2, max_side=9)),
     st.sampled_from([1.0, 1000.0, 5000.0, 1234.5]),
 )
-def test_depth_of_a_16_bit_image_comes_back_to_the_bit(raw: NDArray[np.uint16], per_m: float) -> None:
-    depth_m = raw.astype(np.float32) / np.float32(per_m)
-    packed = pack_measured(depth_m, per_m)
-    assert packed.numbers is Numbers.UNITS
-    np.testing.assert_array_equal(packed.unpacked(), depth_m)
+def test_depth_of_a_16_bit_image_comes_back_to_the_bit(raw: NDArray[np.uint16], units_per_m: float) -> None:
+    depth_m = raw.astype(np.float32) / np.float32(units_per_m)
+    back = decoded(encode_sensor_depth(depth_m, units_per_m))
+    assert back.dtype == np.float32
+    np.testing.assert_array_equal(back, depth_m)
 
 
 @given(arrays.arrays(np.float32, arrays.array_shapes(min_dims=2, max_dims=2, max_side=9)))
-def test_depth_from_anywhere_comes_back_to_the_bit(depth_m: NDArray[np.float32]) -> None:
-    back = pack_measured(depth_m, 5000.0).unpacked()
+def test_any_float32_depth_comes_back_to_the_bit(depth_m: NDArray[np.float32]) -> None:
+    back = decoded(encode_sensor_depth(depth_m, 5000.0))
     assert back.dtype == np.float32
     np.testing.assert_array_equal(back, depth_m)
 
 
 @given(arrays.arrays(np.float32, (5, 7), elements=st.floats(2.0**-10, 2.0**10, width=32)))
 def test_predicted_depth_keeps_half_precision(values: NDArray[np.float32]) -> None:
-    back = pack_predicted(values).unpacked()
+    back = decoded(encode_half_precision(values))
     assert back.dtype == np.float32
-    np.testing.assert_allclose(back, values, rtol=2.0**-11)
+    np.testing.assert_array_equal(back, values.astype(np.float16).astype(np.float32))
     halves = values.astype(np.float16)
-    again = pack_predicted(halves).unpacked()
+    again = decoded(encode_half_precision(halves))
     assert again.dtype == np.float16
     np.testing.assert_array_equal(again, halves)
 
 
-def test_smooth_depth_takes_an_eighth_of_the_room() -> None:
+def test_smooth_depth_takes_an_eighth_of_the_bytes() -> None:
     v, u = np.mgrid[:480, :640]
     wall_m = np.rint((1.0 + 0.002 * u + 0.001 * v) * 5000.0).astype(np.float32) / np.float32(5000.0)
-    assert len(pack_measured(wall_m, 5000.0).data) < wall_m.nbytes / 8
+    assert len(encode_sensor_depth(wall_m, 5000.0).data) < wall_m.nbytes / 8
 
 
-def test_an_image_comes_back_as_an_eye_sees_it() -> None:
-    back = unpack_image(pack_image(image()))
+def test_the_colours_of_an_image_come_back_nearly_as_they_were() -> None:
+    back = decoded(encode_image(image()))
     assert back.shape == image().shape
     assert back.dtype == np.uint8
     assert np.abs(back.astype(int) - image()).mean() < 3.0
 
 
-def test_within_the_budget_nothing_is_put_away() -> None:
+def test_within_the_budget_nothing_is_spilled() -> None:
     store = KeyframeStore(budget_mib=1.0)
     keyframes = [sensor_keyframe(i) for i in range(12)]
-    frames = [keyframe.frame for keyframe in keyframes]
+    frames = [keyframe.frame.load() for keyframe in keyframes]
     store.tidy(keyframes)
-    assert all(keyframe.frame is frame for keyframe, frame in zip(keyframes, frames, strict=True))
-    assert store.away_bytes == 0
+    assert all(keyframe.frame.load() is frame for keyframe, frame in zip(keyframes, frames, strict=True))
+    assert store.spilled_bytes == 0
     # depth is shared by frame and prediction, and counted once
-    assert store.held_bytes == 12 * (48 * 64 * 3 + 48 * 64 * 4)
+    assert store.resident_bytes == 12 * (48 * 64 * 3 + 48 * 64 * 4)
 
 
-def test_beyond_the_budget_the_oldest_are_put_away_and_come_back() -> None:
+def test_beyond_the_budget_the_oldest_are_spilled_and_read_back() -> None:
     each = 48 * 64 * (3 + 4)
     store = KeyframeStore(budget_mib=10 * each / 2**20)
-    keyframes: list[Held] = []
+    keyframes: list[Stored] = []
     for i in range(15):
         keyframes.append(sensor_keyframe(i))
         store.tidy(keyframes)
-        assert store.held_bytes <= 10 * each
-    assert [isinstance(k.frame, StoredFrame) for k in keyframes] == 5 * [True] + 10 * [False]
+        assert store.resident_bytes <= 10 * each
+    assert [k.frame.is_spilled for k in keyframes] == 5 * [True] + 10 * [False]
     for i, keyframe in enumerate(keyframes):
-        assert keyframe.frame.index == i
-        assert keyframe.frame.timestamp_s == i / 30.0
-        assert keyframe.frame.camera is CAMERA
+        frame = keyframe.frame.load()
+        assert (frame.index, frame.timestamp_s) == (i, i / 30.0)
+        assert frame.camera is CAMERA
+        np.testing.assert_array_equal(frame.depth_m, measured(i))
+        assert np.abs(frame.image_rgb.astype(int) - image(i)).mean() < 3.0
         assert keyframe.prediction is not None
-        assert keyframe.prediction.is_sensor
-        assert keyframe.prediction.kind is DepthKind.METRIC
-        assert keyframe.prediction.sigma_log is None
-        np.testing.assert_array_equal(keyframe.frame.depth_m, measured(i))
-        np.testing.assert_array_equal(keyframe.prediction.values, measured(i))
-        assert np.abs(keyframe.frame.image_rgb.astype(int) - image(i)).mean() < 3.0
+        prediction = keyframe.prediction.load()
+        assert prediction.is_sensor
+        assert prediction.kind is DepthKind.METRIC
+        assert prediction.sigma_log is None
+        np.testing.assert_array_equal(prediction.values, measured(i))
 
 
-def test_the_newest_stay_whatever_the_budget() -> None:
+def test_the_depth_that_frame_and_prediction_share_is_written_once() -> None:
+    one, two = SpillFile(), SpillFile()
+    keyframe, frame = sensor_keyframe(0), sensor_keyframe(0).frame
+    assert keyframe.prediction is not None
+    keyframe.prediction.spill(one, keyframe.frame)
+    keyframe.frame.spill(one)
+    frame.spill(two)
+    assert one.size == two.size > 0
+
+
+def test_the_newest_stay_resident_whatever_the_budget() -> None:
     store = KeyframeStore(budget_mib=0.0)
     keyframes = [predicted_keyframe(i) for i in range(11)]
-    values = keyframes[0].prediction.values if keyframes[0].prediction else None
     store.tidy(keyframes)
-    assert sum(isinstance(k.prediction, StoredPrediction) for k in keyframes) == 3
-    first = keyframes[0].prediction
-    assert first is not None
-    assert values is not None
-    assert first.sigma_log is not None
-    assert not first.is_sensor
-    np.testing.assert_allclose(first.values, values, rtol=2.0**-11)
-    np.testing.assert_array_equal(first.sigma_log, (0.1 * values).astype(np.float16))
-    assert keyframes[0].frame.depth_m is None
+    assert [k.prediction.is_spilled for k in keyframes if k.prediction] == 3 * [True] + 8 * [False]
+    assert keyframes[0].frame.load().depth_m is None
 
 
-def test_replacing_a_field_gives_a_plain_value() -> None:
-    store = KeyframeStore(budget_mib=0.0)
-    keyframes = [sensor_keyframe(i) for i in range(9)]
-    store.tidy(keyframes)
-    frame, prediction = keyframes[0].frame, keyframes[0].prediction
-    assert isinstance(frame, StoredFrame)
-    assert isinstance(prediction, StoredPrediction)
-    plain = replace(frame, index=7)
-    assert type(plain) is Frame
-    assert plain.index == 7
-    np.testing.assert_array_equal(plain.depth_m, measured(0))
-    assert type(replace(prediction)) is DepthPrediction
+def test_a_keyframe_knows_the_same_whether_it_is_spilled_or_not() -> None:
+    resident, spilled = predicted_keyframe(0), predicted_keyframe(0)
+    KeyframeStore(budget_mib=0.0).tidy([spilled, *(predicted_keyframe(i) for i in range(8))])
+    for name in ("frame", "prediction"):
+        one, other = getattr(resident, name), getattr(spilled, name)
+        assert (one.is_spilled, other.is_spilled) == (False, True)
+        for item in fields(one.load()):
+            a, b = getattr(one.load(), item.name), getattr(other.load(), item.name)
+            assert type(a) is type(b), item.name
+            if item.name == "image_rgb":
+                assert np.abs(a.astype(int) - b).mean() < 3.0
+            elif isinstance(a, np.ndarray):
+                assert a.dtype == b.dtype
+                np.testing.assert_allclose(a, b, rtol=2.0**-11)
+            else:
+                assert a == b, item.name
+    assert spilled.prediction is not None
+    assert spilled.prediction.load().gravity_share == spilled.prediction.gravity_share == 0.7
+    np.testing.assert_array_equal(spilled.frame.load().gravity, GRAVITY)
 
 
 @pytest.mark.skipif(not hasattr(tempfile, "_O_TMPFILE_WORKS"), reason="files have names on this system")
 def test_the_file_has_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So nothing is left of it, be the process interrupted or killed."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    file = NamelessFile()
-    place = file.put(b"depth")
-    other = file.put(b"colour")
+    file = SpillFile()
+    spilled = [file.spill(encode_sensor_depth(measured(i), 5000.0)) for i in range(2)]
     assert list(tmp_path.iterdir()) == []
-    assert (file.get(place), file.get(other)) == (b"depth", b"colour")
-    assert file.size == 11
+    for i in range(2):
+        np.testing.assert_array_equal(spilled[i].load(), measured(i))
+    assert file.size == sum(len(encode_sensor_depth(measured(i), 5000.0).data) for i in range(2))
     opened = file._file
-    del file
+    del file, spilled
     gc.collect()
     assert opened.closed
 
@@ -184,10 +202,11 @@ def test_where_the_disk_takes_nothing_bytes_stay_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "not-there"))
-    file = NamelessFile()
+    file = SpillFile()
     with caplog.at_level("WARNING", logger="slamdepth"):
-        places = [file.put(b"depth"), file.put(b"colour")]
-    assert [file.get(place) for place in places] == [b"depth", b"colour"]
+        spilled = [file.spill(encode_sensor_depth(measured(i), 5000.0)) for i in range(2)]
+    for i in range(2):
+        np.testing.assert_array_equal(spilled[i].load(), measured(i))
     assert file.size == 0
     assert len(caplog.records) == 1  # not once for each keyframe
     assert "stay in memory" in caplog.text
@@ -205,7 +224,7 @@ def reconstruction(mib: float, change: scene.Change | None = None, model: Any = 
     return run.finish()
 
 
-def test_giving_rows_away_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compacting_the_landmarks_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(landmarks, "_LEAST_ROWS", 64)
     monkeypatch.setattr(frame_log, "_PRUNE_AT", 16)
     results, rows, pruned_at = [], [], []
@@ -219,38 +238,43 @@ def test_giving_rows_away_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> No
         results.append(run.finish())
     assert rows[1] < 0.8 * rows[0]
     assert pruned_at[0] == 16 < pruned_at[1]
-    plain, compact = results
-    np.testing.assert_array_equal(plain.trajectory.T_world_camera, compact.trajectory.T_world_camera)
-    np.testing.assert_array_equal(plain.points_m, compact.points_m)
+    sparse, compact = results
+    np.testing.assert_array_equal(sparse.trajectory.T_world_camera, compact.trajectory.T_world_camera)
+    np.testing.assert_array_equal(sparse.points_m, compact.points_m)
 
 
 @pytest.mark.parametrize("depth", ["sensor", "predicted"])
-def test_a_run_with_nothing_in_memory_is_the_same_run(depth: str) -> None:
+def test_the_memory_budget_does_not_change_the_run(depth: str) -> None:
     if depth == "sensor":
-        plain, away = reconstruction(1e3), reconstruction(0.0)
+        resident, spilled = reconstruction(1e3), reconstruction(0.0)
     else:
-        plain, away = (reconstruction(mib, scene.colour_only, scene.ConstantDepth()) for mib in (1e3, 0.0))
-    np.testing.assert_array_equal(plain.trajectory.T_world_camera, away.trajectory.T_world_camera)
-    np.testing.assert_array_equal(plain.points_m, away.points_m)
-    assert plain.statistics.scale_votes == away.statistics.scale_votes
-    assert len(plain.keyframes) == len(away.keyframes) > 8
-    assert isinstance(away.keyframes[0].frame, StoredFrame)
-    for a, b in zip(plain.keyframes, away.keyframes, strict=True):
-        assert a.depth_m.shape == a.frame.image_rgb.shape[:2]
-        assert a.depth_m.dtype == b.depth_m.dtype == np.float32
-        np.testing.assert_allclose(a.depth_m, b.depth_m, rtol=2e-3, atol=1e-6)
+        resident, spilled = (
+            reconstruction(mib, scene.colour_only, scene.ConstantDepth()) for mib in (1e3, 0.0)
+        )
+    np.testing.assert_array_equal(resident.trajectory.T_world_camera, spilled.trajectory.T_world_camera)
+    np.testing.assert_array_equal(resident.points_m, spilled.points_m)
+    assert resident.statistics.scale_votes == spilled.statistics.scale_votes
+    assert len(resident.keyframes) == len(spilled.keyframes) > 8
+    assert spilled.keyframes[0].frame.is_spilled
+    for a, b in zip(resident.keyframes, spilled.keyframes, strict=True):
+        depth_m = a.load_depth_m()
+        assert depth_m.shape == a.frame.load().image_rgb.shape[:2]
+        assert depth_m.dtype == b.load_depth_m().dtype == np.float32
+        np.testing.assert_allclose(depth_m, b.load_depth_m(), rtol=2e-3, atol=1e-6)
         assert a.depth_scale == b.depth_scale
         np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
-    twice = rescaled(away, 2.0).keyframes[0]
-    np.testing.assert_array_equal(twice.depth_m, away.keyframes[0].depth_m * np.float32(2.0))
-    np.testing.assert_array_equal(twice.T_world_camera[:3, 3], 2.0 * away.keyframes[0].T_world_camera[:3, 3])
-    assert twice.depth_scale == 2.0 * away.keyframes[0].depth_scale
+    twice = rescaled(spilled, 2.0).keyframes[0]
+    np.testing.assert_array_equal(twice.load_depth_m(), spilled.keyframes[0].load_depth_m() * np.float32(2.0))
     np.testing.assert_array_equal(
-        rescaled(rescaled(away, 2.0), 0.5).keyframes[0].depth_m, away.keyframes[0].depth_m
+        twice.T_world_camera[:3, 3], 2.0 * spilled.keyframes[0].T_world_camera[:3, 3]
+    )
+    assert twice.depth_scale == 2.0 * spilled.keyframes[0].depth_scale
+    np.testing.assert_array_equal(
+        rescaled(rescaled(spilled, 2.0), 0.5).keyframes[0].load_depth_m(), spilled.keyframes[0].load_depth_m()
     )
 
 
-def test_a_keyframe_and_a_frame_take_little() -> None:
+def test_the_memory_of_a_keyframe_and_of_a_frame_is_bounded() -> None:
     """What stays in memory of an old keyframe, and of an ordinary frame, has a bound."""
     config = Config.from_dict(
         {
@@ -268,7 +292,7 @@ def test_a_keyframe_and_a_frame_take_little() -> None:
     assert held.points < 2 * 4096 * 256
     newest = 8 * 320 * 240 * (3 + 4)
     assert held.images == newest
-    assert 0 < held.on_disk < (keyframes - 8) * 320 * 240 * 2
+    assert 0 < held.on_disk < (keyframes - 8) * 320 * 240 * 3
 
 
 def test_going_back_and_forth_makes_few_keyframes() -> None:

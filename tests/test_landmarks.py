@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from slamdepth.geometry import se3_exp
+from slamdepth.mapping.keyframe_store import StoredFrame
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.types import Camera, Frame
 
@@ -30,7 +31,7 @@ def keyframe(id_: int, n: int = 8, T: np.ndarray | None = None) -> MapKeyframe:
     rng = np.random.default_rng(id_)
     return MapKeyframe(
         id=id_,
-        frame=FRAME,
+        frame=StoredFrame(FRAME),
         features=FakeFeatures(rng.integers(0, 256, (n, 32), dtype=np.uint8), rng.integers(0, 8, n)),
         T_camera_world=np.eye(4) if T is None else T,
         point_ids=np.full(n, -1, dtype=np.int64),

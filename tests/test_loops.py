@@ -15,6 +15,7 @@ from slamdepth.backend.pose_graph import Edge
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, invert, project, rotation_angle_rad, se3_exp, so3_exp, transform
+from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracking.localiser import Localiser, Placement
 from slamdepth.tracking.loop_closer import Correction, LoopCloser
@@ -112,7 +113,7 @@ class World:
         features = Features(px, px, np.zeros(n, np.int64), np.ones(n), descriptors[seen])
         keyframe = MapKeyframe(
             id=k,
-            frame=Frame(k, float(k), BLANK, CAMERA),
+            frame=StoredFrame(Frame(k, float(k), BLANK, CAMERA)),
             features=features,
             T_camera_world=invert(self._pose),
             point_ids=np.array(
@@ -121,8 +122,10 @@ class World:
             ),
             log_depth=np.log(z * scale),
             sigma_log=np.full(n, 0.02),
-            prediction=DepthPrediction(
-                np.zeros((480, 640), np.float32), DepthKind.METRIC, None, is_sensor=self._is_sensor
+            prediction=StoredPrediction(
+                DepthPrediction(
+                    np.zeros((480, 640), np.float32), DepthKind.METRIC, None, is_sensor=self._is_sensor
+                )
             ),
             scale=scale,
         )
@@ -380,7 +383,7 @@ def test_no_loop_between_two_places_that_only_look_alike() -> None:
     fake = Features(px, px, first.octave, first.sigma_px, first.descriptors)
     impostor = MapKeyframe(
         id=len(world.map.keyframes),
-        frame=Frame(99, 99.0, BLANK, CAMERA),
+        frame=StoredFrame(Frame(99, 99.0, BLANK, CAMERA)),
         features=fake,
         T_camera_world=keyframe.T_camera_world.copy(),
         point_ids=np.full(n, -1, dtype=np.int64),

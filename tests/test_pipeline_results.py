@@ -9,6 +9,7 @@ from made_up import MadeUpDataset, pose
 
 from slamdepth.depth.alignment import as_given
 from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.results import judge_trajectory, keyframe_trajectory, score_depth
 from slamdepth.types import DepthKind, DepthPrediction, Trajectory
@@ -19,11 +20,11 @@ def keyframe(number: int, scale: float, *, is_sensor: bool = False) -> Keyframe:
     depth = np.full((6, 8), (1.0 + number) * scale, np.float32)
     return Keyframe(
         number,
-        dataset.read(number),
+        StoredFrame(dataset.read(number)),
         pose(number),
         np.zeros((0, 2)),
         1.0,
-        DepthPrediction(depth, DepthKind.METRIC, is_sensor=is_sensor),
+        StoredPrediction(DepthPrediction(depth, DepthKind.METRIC, is_sensor=is_sensor)),
         as_given,
     )
 

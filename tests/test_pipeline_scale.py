@@ -21,6 +21,7 @@ from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.geometry import se3_exp
 from slamdepth.mapping.floor import find_floor
 from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.known_size import (
     ScaleEstimate,
@@ -85,8 +86,8 @@ def room(
     for number in range(4):
         T_level_camera = se3_exp(np.array([0.1 * number, 0.02 * number, 0, -tilt_rad, 0.1 * number, 0]))
         depth_m = room_depth(T_level_camera, floor_m, desk_m)
-        frame = Frame(number, number / 10, np.zeros((240, 320, 3), np.uint8), CAMERA)
-        prediction = DepthPrediction(depth_m, DepthKind.METRIC, is_sensor=is_sensor)
+        frame = StoredFrame(Frame(number, number / 10, np.zeros((240, 320, 3), np.uint8), CAMERA))
+        prediction = StoredPrediction(DepthPrediction(depth_m, DepthKind.METRIC, is_sensor=is_sensor))
         T = np.linalg.inv(first) @ T_level_camera
         keyframes.append(Keyframe(number, frame, T, np.zeros((0, 2)), 1.0, prediction, as_given))
     return tuple(keyframes)
@@ -206,7 +207,7 @@ def test_rescaling_multiplies_every_length_and_nothing_else() -> None:
     np.testing.assert_array_equal(after.trajectory.T_world_camera, scaled(before.trajectory, 2.0))
     np.testing.assert_array_equal(after.points_m, 2 * before.points_m)
     for a, b in zip(after.keyframes, before.keyframes, strict=True):
-        np.testing.assert_array_equal(a.depth_m, 2 * b.depth_m)
+        np.testing.assert_array_equal(a.load_depth_m(), 2 * b.load_depth_m())
         np.testing.assert_array_equal(a.T_world_camera[:3, 3], 2 * b.T_world_camera[:3, 3])
         np.testing.assert_array_equal(a.T_world_camera[:3, :3], b.T_world_camera[:3, :3])
         assert (a.depth_scale, a.prediction) == (2 * b.depth_scale, b.prediction)

@@ -26,6 +26,7 @@ from slamdepth.errors import OutputError
 from slamdepth.evaluation import DepthScorer, score_trajectory
 from slamdepth.geometry import se3_exp
 from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report import (
     MeshCounts,
@@ -85,8 +86,8 @@ def keyframe(number: int, *, is_sensor: bool = False) -> Keyframe:
     image = rng.integers(0, 255, size=(24, 32, 3), dtype=np.uint8)
     depth = rng.uniform(0.5, 4.0, size=(24, 32)).astype(np.float32)
     depth[0] = 0.0
-    frame = Frame(number * 10, 100.0 + number / 3, image, CAMERA, depth)
-    prediction = DepthPrediction(depth, DepthKind.METRIC, is_sensor=is_sensor)
+    frame = StoredFrame(Frame(number * 10, 100.0 + number / 3, image, CAMERA, depth))
+    prediction = StoredPrediction(DepthPrediction(depth, DepthKind.METRIC, is_sensor=is_sensor))
     pose = trajectory().T_world_camera[number * 10]
     return Keyframe(number, frame, pose, np.zeros((1, 2)), 1.0 + 0.1 * number, prediction, as_given)
 
@@ -98,7 +99,7 @@ def full_data() -> ReportData:
     keyframes = tuple(keyframe(i) for i in range(6))
     scorer = DepthScorer(stride=1)
     for k in keyframes:
-        scorer.add(k.depth_m * 1.1, k.frame.depth_m)
+        scorer.add(k.load_depth_m() * 1.1, k.frame.load().depth_m)
     states = [TrackingStatus.INITIALISING, *[TrackingStatus.TRACKING] * 29, *[TrackingStatus.LOST] * 10]
     states += [TrackingStatus.RELOCALISED, *[TrackingStatus.TRACKING] * 39]
     steps = tuple(

@@ -13,6 +13,7 @@ from slamdepth.backend.bundle import BundleProblem, bundle_adjust
 from slamdepth.backend.resection import placed_anew
 from slamdepth.config import Config
 from slamdepth.geometry import invert, project, rotation_angle_rad, se3_exp, transform
+from slamdepth.mapping.keyframe_store import StoredFrame
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracking import map_adjuster
 from slamdepth.tracking.map_adjuster import MapAdjuster
@@ -184,7 +185,7 @@ def map_of(problem: BundleProblem) -> LandmarkMap:
         at = np.flatnonzero(problem.obs_camera == k)
         n, point = len(at), problem.obs_point[at]
         features = Seen(problem.px[at], np.ones(n), np.zeros((n, 32), np.uint8), np.zeros(n, np.int64))
-        frame = Frame(k, k / 30, np.zeros((480, 640, 3), np.uint8), CAMERA)
+        frame = StoredFrame(Frame(k, k / 30, np.zeros((480, 640, 3), np.uint8), CAMERA))
         known = row_of[point]
         unsure = np.full(n, np.nan)
         keyframe = MapKeyframe(k, frame, features, T.copy(), known.copy(), unsure, unsure.copy())

@@ -86,10 +86,10 @@ def test_the_reconstruction_is_consistent(
         assert [k.frame.index for k in made.keyframes] == keyframe_indices
         for k in made.keyframes:
             np.testing.assert_allclose(k.T_world_camera, trajectory.T_world_camera[k.frame.index], atol=1e-9)
-            assert k.depth_m.shape == (CAMERA.height, CAMERA.width)
-            assert k.depth_m.dtype == np.float32
-            assert np.isfinite(k.depth_m).all()
-            assert (k.depth_m > 0).mean() > 0.9
+            assert k.load_depth_m().shape == (CAMERA.height, CAMERA.width)
+            assert k.load_depth_m().dtype == np.float32
+            assert np.isfinite(k.load_depth_m()).all()
+            assert (k.load_depth_m() > 0).mean() > 0.9
             assert k.keypoints_px.shape[1] == 2
             assert 0.3 < k.depth_scale < 3.0
         assert made.points_m.shape[1] == 3
@@ -159,7 +159,7 @@ def test_the_constant_prior_was_bent_to_the_scene(constant_run: tuple[Run, Recon
     spread = []
     for k in made.keyframes[1:]:
         truth = walk()[0][k.frame.index].depth_m
-        before, after = np.log(k.prediction.values / truth), np.log(k.depth_m / truth)
+        before, after = np.log(k.prediction.load().values / truth), np.log(k.load_depth_m() / truth)
         spread.append((before.std(), after.std()))
     before, after = np.mean(spread, axis=0)
     assert after < 0.8 * before
@@ -246,7 +246,7 @@ def test_a_run_may_end_at_once(indices: list[int], predicted: bool) -> None:
     made = Run(frames(indices), ConstantDepth() if predicted else None).finish()
     assert made.statistics.tracked == len(indices)
     assert len(made.keyframes) >= 1
-    assert made.keyframes[0].depth_m.shape == (CAMERA.height, CAMERA.width)
+    assert made.keyframes[0].load_depth_m().shape == (CAMERA.height, CAMERA.width)
     assert made.points_m.shape[1] == 3
 
 

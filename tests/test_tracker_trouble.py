@@ -157,8 +157,8 @@ def test_holes_and_nonsense_in_the_depth() -> None:
     made = run.finish()
     assert ate_m(made.trajectory) < 0.012
     for k in made.keyframes:
-        assert np.isfinite(k.depth_m).all()
-        assert (k.depth_m >= 0).all()
+        assert np.isfinite(k.load_depth_m()).all()
+        assert (k.load_depth_m() >= 0).all()
 
 
 def test_a_network_with_holes() -> None:
@@ -173,7 +173,7 @@ def test_a_network_with_holes() -> None:
     assert run.statuses() == {TRACKING: 30}
     made = run.finish()
     assert ate_m(made.trajectory, with_scale=True) < 0.02
-    assert all(np.isfinite(k.depth_m).all() for k in made.keyframes)
+    assert all(np.isfinite(k.load_depth_m()).all() for k in made.keyframes)
 
 
 def test_a_network_that_does_not_say_how_sure_it_is() -> None:
@@ -211,11 +211,11 @@ def test_whole_predictions_that_disagree_with_the_map_are_dropped() -> None:
     run = Run(frames(change=colour_only), model)
     made = run.finish()
     assert run.statuses() == {TRACKING: COUNT}
-    empty = [keyframe.id for keyframe in made.keyframes if not keyframe.prediction.values.any()]
+    empty = [keyframe.id for keyframe in made.keyframes if not keyframe.prediction.load().values.any()]
     assert empty  # not the fourth keyframe: the map knows too little by then
     assert all(id % 4 == 3 for id in empty)
     assert any(f"{len(empty)} predicted depth maps disagreed" in note for note in made.notes)
-    assert not any(made.keyframes[k].depth_m.any() for k in empty)
+    assert not any(made.keyframes[k].load_depth_m().any() for k in empty)
     assert ate_m(made.trajectory, with_scale=True) < 0.02
     honest = Run(frames(change=colour_only), ConstantDepth(sigma_log=0.3)).finish()
-    assert all(keyframe.prediction.values.any() for keyframe in honest.keyframes)
+    assert all(keyframe.prediction.load().values.any() for keyframe in honest.keyframes)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from slamdepth.errors import ConfigError
 from slamdepth.geometry import invert, se3_exp
 from slamdepth.mapping.fusion_depth import View, consistent_pixels, trusted_depth
 from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapping.tsdf import fuse_keyframes
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, Trajectory
@@ -53,17 +55,21 @@ def keyframe(
     depth = depth * np.float32(factor)
     return Keyframe(
         id=number,
-        frame=Frame(number, float(number), image, camera),
+        frame=StoredFrame(Frame(number, float(number), image, camera)),
         T_world_camera=T_world_camera,
         keypoints_px=np.zeros((0, 2)),
         depth_scale=1.0,
-        prediction=DepthPrediction(depth, DepthKind.METRIC, is_sensor=is_sensor),
+        prediction=StoredPrediction(DepthPrediction(depth, DepthKind.METRIC, is_sensor=is_sensor)),
         in_metres=as_given,
     )
 
 
+def with_prediction(kf: Keyframe, **changes: Any) -> Keyframe:
+    return replace(kf, prediction=StoredPrediction(replace(kf.prediction.load(), **changes)))
+
+
 def with_depth(kf: Keyframe, depth_m: np.ndarray) -> Keyframe:
-    return replace(kf, prediction=replace(kf.prediction, values=depth_m))
+    return with_prediction(kf, values=depth_m)
 
 
 def poses() -> list[np.ndarray]:
@@ -105,7 +111,9 @@ def test_triangles_face_the_cameras() -> None:
 def test_ignoring_the_distortion_would_show() -> None:
     """The distorted case above proves something: taken as pinhole, colours land elsewhere."""
     taken = keyframe(0, DISTORTED, poses()[0])
-    mesh = fuse_keyframes([replace(taken, frame=replace(taken.frame, camera=CAMERA))], SETTINGS)
+    mesh = fuse_keyframes(
+        [replace(taken, frame=StoredFrame(replace(taken.frame.load(), camera=CAMERA)))], SETTINGS
+    )
     on_wall = mesh.vertices_m[:, 2] > WALL_Z - 0.02
     expected = (100 + 60 * mesh.vertices_m[:, :2]) / 255
     assert np.abs(mesh.colors[:, :2] - expected)[on_wall].max() > 0.04
@@ -165,15 +173,15 @@ def test_unsure_predictions_are_dropped_and_unsure_sensors_are_not() -> None:
     kf = keyframe(0, CAMERA, np.eye(4), is_sensor=False)
     sigma = np.full((120, 160), 0.1, np.float32)
     sigma[:, :30] = 0.7
-    unsure = replace(kf, prediction=replace(kf.prediction, sigma_log=sigma))
+    unsure = with_prediction(kf, sigma_log=sigma)
     assert (trusted_depth(unsure, 4.0)[:, :30] == 0).all()
-    measured = replace(kf, prediction=replace(unsure.prediction, is_sensor=True))
+    measured = with_prediction(unsure, is_sensor=True)
     assert (trusted_depth(measured, 4.0)[:, :30] > 0).mean() > 0.9
 
 
 def test_specks_are_removed() -> None:
     kf = keyframe(0, CAMERA, np.eye(4))
-    depth = kf.depth_m.copy()
+    depth = kf.load_depth_m().copy()
     depth[:, 120:] = 0
     depth[50:60, 130:140] = 1.0
     with_speck = fuse_keyframes(
@@ -197,7 +205,7 @@ def test_memory_is_bounded_by_larger_voxels() -> None:
 def test_nothing_to_fuse_is_an_empty_mesh_with_a_note() -> None:
     assert fuse_keyframes([], SETTINGS).notes == ("no mesh: there are no keyframes",)
     kf = keyframe(0, CAMERA, np.eye(4))
-    blank = fuse_keyframes([with_depth(kf, np.zeros_like(kf.depth_m))], SETTINGS)
+    blank = fuse_keyframes([with_depth(kf, np.zeros_like(kf.load_depth_m()))], SETTINGS)
     assert blank.vertices_m.shape == blank.triangles.shape == blank.colors.shape == (0, 3)
     assert "no keyframe has depth" in blank.notes[0]
     too_small = fuse_keyframes([kf], MapConfig(voxel_size_m=0.1, min_component_triangles=10**6))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pixels of a keyframe's depth deserve to be fused."""
+"""Which pixels of a keyframe's depth are fused."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ _MAX_NEIGHBOURS = 8
 
 
 def trusted_depth(keyframe: Keyframe, max_depth_m: float) -> Floats32:
-    """Depth ``(H, W)`` in the raw pixels of ``keyframe`` with what cannot be trusted set to 0.
+    """Depth ``(H, W)`` in metres, in the raw pixels of ``keyframe``, with unreliable pixels set to 0.
 
-    Dropped are depths beyond ``max_depth_m``, flying pixels at depth jumps and, of
-    predicted depth, the quarter the model is least sure of (never those with a
-    ``sigma_log`` under 0.15, always those over 0.6).
+    Dropped are depths beyond ``max_depth_m``, flying pixels at depth jumps and, of predicted depth, the
+    quarter with the largest ``sigma_log`` (never one below 0.15, always one above 0.6).
     """
-    depth_m = keyframe.depth_m
+    prediction = keyframe.prediction.load()
+    depth_m = keyframe.in_metres(prediction)
     depth = np.where(np.isfinite(depth_m), depth_m, np.float32(0.0)).astype(np.float32)
     drop = (depth <= 0.0) | (depth > max_depth_m) | _at_jumps(depth)
-    sigma_log = None if keyframe.prediction.is_sensor else keyframe.sigma_log
+    sigma_log = None if prediction.is_sensor else prediction.sigma_log
     if sigma_log is not None:
         sigma = np.where(np.isfinite(sigma_log), sigma_log, np.inf)
         valid = sigma[~drop]
@@ -67,7 +67,7 @@ def _at_jumps(depth: Floats32) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class View:
-    """A keyframe's depth, undistorted and thinned out, for comparing keyframes.
+    """A keyframe's depth, undistorted and subsampled, for comparison with other keyframes.
 
     Attributes:
         camera: undistorted, of the size of ``depth_m``.
@@ -81,7 +81,7 @@ class View:
 
     @classmethod
     def of(cls, depth_m: Floats32, camera: Camera, T_world_camera: NDArray[np.float64]) -> View:
-        """Thin out undistorted depth ``(H, W)`` by nearest pixels."""
+        """Subsample undistorted depth ``(H, W)`` by nearest neighbour."""
         step = max(1, camera.width // _VIEW_WIDTH_PX)
         thin = np.ascontiguousarray(depth_m[step // 2 :: step, step // 2 :: step])
         first = step // 2
@@ -105,7 +105,12 @@ class View:
     def seen(
         self, points_world: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]]:
-        """Depth ``(N,)`` of points ``(N, 3)`` here, the depth found at their pixels, where both are known."""
+        """Project points ``(N, 3)`` into this view.
+
+        Returns:
+            Their depth ``(N,)``, the depth ``(N,)`` found at their pixels, and a mask ``(N,)`` where both
+            exist.
+        """
         pixels, z = project(self.camera, transform(invert(self.T_world_camera), points_world))
         column, row = np.round(np.clip(pixels, -1e6, 1e6)).astype(np.int64).T
         known = (
@@ -117,12 +122,11 @@ class View:
 
 
 def consistent_pixels(views: Sequence[View]) -> list[NDArray[np.bool_]]:
-    """For each view, the pixels ``(h, w)`` that the views overlapping it do not outvote.
+    """For each view a mask ``(h, w)`` of the pixels that overlapping views confirm or do not contradict.
 
-    A pixel's surface is looked up in up to eight other views. One that measures the same depth to
-    10 % votes for it; one that sees through it, against it; one that sees something nearer,
-    half against it, for that may be an honest occlusion. Pixels that lose by a whole vote are
-    dropped.
+    Each pixel's point is projected into up to eight other views. A view that measures the same depth to
+    10 % counts +1, one that sees through the point -1, and one that sees something nearer -0.5, because
+    that may be an occlusion. Pixels with a sum of -1 or less are dropped.
     """
     overlap = _overlaps(views)
     keep = []
@@ -142,7 +146,7 @@ def consistent_pixels(views: Sequence[View]) -> list[NDArray[np.bool_]]:
 
 
 def _overlaps(views: Sequence[View]) -> NDArray[np.float64]:
-    """Share ``(N, N)`` of the points of view i that lie before a known pixel of view j."""
+    """Share ``(N, N)`` of the points of view i that project to a known pixel of view j."""
     share = np.zeros((len(views), len(views)))
     for i, view in enumerate(views):
         points, _ = view.points_world(step=12)
@@ -155,7 +159,7 @@ def _overlaps(views: Sequence[View]) -> NDArray[np.float64]:
 
 
 def _neighbours(overlap: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Overlapping views, from the most alike to the least: alike ones share a network's mistakes."""
+    """Overlapping views, spread from the most to the least overlap: views alike share a network's errors."""
     order = np.argsort(-overlap, kind="stable")
     order = order[overlap[order] >= _MIN_OVERLAP]
     if len(order) <= _MAX_NEIGHBOURS:

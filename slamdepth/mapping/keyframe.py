@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.types import DepthPrediction, Frame
+from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
+from slamdepth.types import DepthPrediction
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,43 +20,38 @@ if TYPE_CHECKING:
 class Keyframe:
     """A keyframe after optimisation, with what the map fusion needs.
 
-    Images and predictions of a tracker's keyframes may be read when they are asked for, each
-    time anew, because those of all keyframes together may be more than memory holds. Dense depth in
-    metres of the map is made each time for the same reason.
+    The images of all keyframes may be more than memory holds. So a keyframe has handles, whose ``load()``
+    may read from disk, and dense depth in metres of the map is computed by :meth:`load_depth_m`.
 
     Attributes:
         id: number of the keyframe, from 0.
-        frame: its image (and sensor depth where there is one).
+        frame: handle of its image (and sensor depth where there is one).
         T_world_camera: ``(4, 4)`` optimised pose.
         keypoints_px: ``(N, 2)`` float64 raw pixels.
         depth_scale: factor that turned the prediction into metres of the map.
-        prediction: the map before scaling, as the model gave it.
-        in_metres: what makes :attr:`depth_m` of the prediction.
+        prediction: handle of the depth prediction as the model gave it, before scaling.
+        in_metres: turns the prediction into ``(H, W)`` float32 depth in metres of the map.
     """
 
     id: int
-    frame: Frame
+    frame: StoredFrame
     T_world_camera: NDArray[np.float64]
     keypoints_px: NDArray[np.float64]
     depth_scale: float
-    prediction: DepthPrediction
+    prediction: StoredPrediction
     in_metres: Callable[[DepthPrediction], NDArray[np.float32]]
 
-    @property
-    def depth_m(self) -> NDArray[np.float32]:
-        """``(H, W)`` metres of the map, 0 where unknown or dropped; in the raw (distorted) pixels of
-        the frame."""
-        return self.in_metres(replace(self.prediction))  # read once, should it lie on disk
+    def load_depth_m(self) -> NDArray[np.float32]:
+        """Dense depth ``(H, W)`` float32 in metres of the map, 0 where unknown or rejected.
 
-    @property
-    def sigma_log(self) -> NDArray[np.float32] | None:
-        """``(H, W)`` or None; see :class:`DepthPrediction`."""
-        return self.prediction.sigma_log
+        Its pixels are the raw (distorted) ones of the frame. Computed on each call.
+        """
+        return self.in_metres(self.prediction.load())
 
     def rescaled(self, factor: float) -> Keyframe:
-        """The keyframe in a map whose lengths were multiplied by ``factor``.
+        """The keyframe in a map whose lengths are multiplied by ``factor``.
 
-        Prediction and sensor depth stay as they were given; what the map makes of them changes.
+        Prediction and sensor depth stay as they were given; pose and depth in metres of the map change.
         """
         T = self.T_world_camera.copy()
         T[:3, 3] *= factor

@@ -1,224 +1,174 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the images and depth maps of old keyframes lie until the end of a run.
+"""Images and depth maps of keyframes within a memory budget.
 
-Tracking needs them of the newest keyframes only, the mesh and the report those of all, one
-after the other. So beyond a budget they are packed and put away in a temporary file, and
-read again when they are asked for.
+Tracking needs those of the newest keyframes only; mesh and report need all of them, one keyframe after
+the other. Beyond the budget, the oldest are spilled to a temporary file and read back on ``load()``.
 """
 
 from __future__ import annotations
 
-import logging
-import tempfile
-import threading
-import weakref
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
-from slamdepth.mapping.packing import PackedMap, pack_image, pack_measured, pack_predicted, unpack_image
+from slamdepth.mapping.codec import encode_half_precision, encode_image, encode_sensor_depth
+from slamdepth.mapping.spill_file import SpilledArray, SpillFile
 from slamdepth.types import DepthPrediction, Frame
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
-log = logging.getLogger(__name__)
+_NEWEST = 8  # never spilled: tracking still reads them
 
-Place = tuple[int, int] | bytes
-"""Where in a file bytes lie, from where on and how many; the bytes themselves where it took none."""
 
-_NEWEST = 8  # never put away: tracking still looks at them
+class StoredFrame:
+    """Handle of a frame whose images are in memory or spilled to a file.
+
+    Attributes:
+        index, timestamp_s, camera, gravity: as for :class:`slamdepth.Frame`; always in memory.
+    """
+
+    def __init__(self, frame: Frame) -> None:
+        self.index, self.timestamp_s = frame.index, frame.timestamp_s
+        self.camera, self.gravity = frame.camera, frame.gravity
+        self._resident: Frame | None = frame
+        self._image: SpilledArray | None = None
+        self._depth: SpilledArray | None = None
+
+    @property
+    def is_spilled(self) -> bool:
+        return self._resident is None
+
+    def load(self) -> Frame:
+        """The frame; where it was spilled, read from the file each time.
+
+        Depth is what it was to the bit. The colours of a spilled frame are those of a JPEG of quality 95.
+        """
+        if (frame := self._resident) is not None:
+            return frame
+        assert self._image is not None
+        depth_m = None if self._depth is None else self._depth.load()
+        return Frame(
+            self.index, self.timestamp_s, self._image.load(), self.camera, depth_m, gravity=self.gravity
+        )
+
+    def spill(self, file: SpillFile) -> None:
+        """Move the images to ``file``."""
+        if (frame := self._resident) is None:
+            return
+        if frame.depth_m is not None:
+            self._depth = file.spill(encode_sensor_depth(frame.depth_m, frame.camera.depth_factor))
+        self._image = file.spill(encode_image(frame.image_rgb))
+        self._resident = None
+
+
+class StoredPrediction:
+    """Handle of a prediction whose maps are in memory or spilled to a file.
+
+    Attributes:
+        kind, is_sensor, gravity, gravity_share: as for :class:`slamdepth.DepthPrediction`; always in memory.
+    """
+
+    def __init__(self, prediction: DepthPrediction) -> None:
+        self.kind, self.is_sensor = prediction.kind, prediction.is_sensor
+        self.gravity, self.gravity_share = prediction.gravity, prediction.gravity_share
+        self._resident: DepthPrediction | None = prediction
+        self._values: SpilledArray | None = None
+        self._sigma_log: SpilledArray | None = None
+
+    @property
+    def is_spilled(self) -> bool:
+        return self._resident is None
+
+    def load(self) -> DepthPrediction:
+        """The prediction; where it was spilled, read from the file each time.
+
+        A spilled sensor map is what it was to the bit, a network's is rounded to half precision.
+        """
+        if (prediction := self._resident) is not None:
+            return prediction
+        assert self._values is not None
+        return DepthPrediction(
+            self._values.load(),
+            self.kind,
+            None if self._sigma_log is None else self._sigma_log.load(),
+            is_sensor=self.is_sensor,
+            gravity=self.gravity,
+            gravity_share=self.gravity_share,
+        )
+
+    def spill(self, file: SpillFile, frame: StoredFrame) -> None:
+        """Move the maps to ``file``.
+
+        Args:
+            frame: what the prediction was made for. Values that are its sensor depth are written once.
+        """
+        if (prediction := self._resident) is None:
+            return
+        if not prediction.is_sensor:
+            self._values = file.spill(encode_half_precision(prediction.values))
+        elif prediction.values is frame.load().depth_m:
+            frame.spill(file)
+            self._values = frame._depth
+        else:
+            self._values = file.spill(encode_sensor_depth(prediction.values, frame.camera.depth_factor))
+        if prediction.sigma_log is not None:
+            self._sigma_log = file.spill(encode_half_precision(prediction.sigma_log))
+        self._resident = None
 
 
 class HasImages(Protocol):
-    """A keyframe while it may change."""
+    """A keyframe of the map or of a tracker."""
 
-    frame: Frame
-    prediction: DepthPrediction | None
+    @property
+    def frame(self) -> StoredFrame: ...
+
+    @property
+    def prediction(self) -> StoredPrediction | None: ...
 
 
 class KeyframeStore:
-    """Keeps the images and depth maps of keyframes within a budget of memory.
+    """Keeps images and depth maps of keyframes within a memory budget.
 
     Args:
-        budget_mib: what may lie in memory, unpacked, beside the newest keyframes'.
+        budget_mib: bytes that images and maps may take in memory, decoded; the newest eight keyframes stay
+            whatever the budget.
     """
 
     def __init__(self, budget_mib: float) -> None:
         self._budget_bytes = budget_mib * 2**20
-        self._file = NamelessFile()
+        self._file = SpillFile()
         self._sizes: list[int] = []
-        self._away = 0
+        self._spilled = 0
 
     @property
-    def held_bytes(self) -> int:
-        """Of images and depth maps in memory."""
-        return sum(self._sizes[self._away :])
+    def resident_bytes(self) -> int:
+        """Bytes of images and depth maps in memory."""
+        return sum(self._sizes[self._spilled :])
 
     @property
-    def away_bytes(self) -> int:
-        """Of the temporary file."""
+    def spilled_bytes(self) -> int:
+        """Size of the temporary file."""
         return self._file.size
 
     def tidy(self, keyframes: Sequence[HasImages]) -> None:
-        """Put the oldest of ``keyframes`` away until the rest is within the budget.
+        """Spill the oldest of ``keyframes`` until the rest is within the budget.
 
         Args:
             keyframes: all so far, in the same order each time, each with its prediction.
         """
         self._sizes += [_size(keyframe) for keyframe in keyframes[len(self._sizes) :]]
-        while self.held_bytes > self._budget_bytes and self._away < len(keyframes) - _NEWEST:
-            self._put_away(keyframes[self._away])
-            self._away += 1
-
-    def _put_away(self, keyframe: HasImages) -> None:
-        frame = StoredFrame.of(keyframe.frame, self._file)
-        if keyframe.prediction is not None:
-            is_frames = keyframe.prediction.values is keyframe.frame.depth_m
-            keyframe.prediction = StoredPrediction.of(
-                keyframe.prediction, self._file, frame if is_frames else None, frame.camera.depth_factor
-            )
-        keyframe.frame = frame
+        while self.resident_bytes > self._budget_bytes and self._spilled < len(keyframes) - _NEWEST:
+            keyframe = keyframes[self._spilled]
+            if keyframe.prediction is not None:
+                keyframe.prediction.spill(self._file, keyframe.frame)
+            keyframe.frame.spill(self._file)
+            self._spilled += 1
 
 
 def _size(keyframe: HasImages) -> int:
-    arrays = [keyframe.frame.image_rgb, keyframe.frame.depth_m]
+    frame = keyframe.frame.load()
+    arrays: list[NDArray[Any] | None] = [frame.image_rgb, frame.depth_m]
     if keyframe.prediction is not None:
-        arrays += [keyframe.prediction.values, keyframe.prediction.sigma_log]
+        prediction = keyframe.prediction.load()
+        arrays += [prediction.values, prediction.sigma_log]
     return sum({id(array): array.nbytes for array in arrays if array is not None}.values())
-
-
-class NamelessFile:
-    """A temporary file without a name, so that nothing is left of it however the process ends.
-
-    Where the disk takes no more, bytes stay in memory. Any thread may use it.
-    """
-
-    def __init__(self) -> None:
-        self._file: Any = None
-        self._lock = threading.Lock()
-        self._has_failed = False
-        self.size = 0
-
-    def put(self, data: bytes) -> Place:
-        """Put bytes away; returns what :meth:`get` takes."""
-        with self._lock:
-            try:
-                if self._file is None:
-                    self._file = tempfile.TemporaryFile(prefix="slamdepth-", buffering=0)  # noqa: SIM115
-                    weakref.finalize(self, self._file.close)
-                self._file.seek(self.size)
-                if self._file.write(data) != len(data):
-                    raise OSError("the disk is full")
-            except OSError as error:
-                level = logging.DEBUG if self._has_failed else logging.WARNING
-                log.log(level, "keyframes stay in memory: no temporary file can be written: %s", error)
-                self._has_failed = True
-                return data
-            place = (self.size, len(data))
-            self.size += len(data)
-            return place
-
-    def get(self, place: Place) -> bytes:
-        """The bytes that were put there."""
-        if isinstance(place, bytes):
-            return place
-        start, length = place
-        with self._lock:
-            self._file.seek(start)
-            return bytes(self._file.read(length))
-
-
-class _DepthAway:
-    """A packed depth map whose bytes lie in a file."""
-
-    def __init__(self, packed: PackedMap, file: NamelessFile) -> None:
-        self._about, self._file = replace(packed, data=b""), file
-        self._place = file.put(packed.data)
-
-    def get(self) -> NDArray[Any]:
-        return replace(self._about, data=self._file.get(self._place)).unpacked()
-
-
-class StoredFrame(Frame):
-    """A frame whose images are read and unpacked each time they are asked for.
-
-    The colours are those of a good JPEG, depth is what it was to the bit.
-    """
-
-    _file: NamelessFile
-    _image: Place
-    _depth: _DepthAway | None
-
-    def __new__(cls, *args: Any, **fields: Any) -> Any:
-        """A plain frame: what ``dataclasses.replace`` makes of a stored one."""
-        return Frame(*args, **fields)
-
-    @classmethod
-    def of(cls, frame: Frame, file: NamelessFile) -> StoredFrame:
-        """Put the images of ``frame`` away in ``file``."""
-        stored = object.__new__(cls)
-        measured = frame.depth_m
-        depth = None
-        if measured is not None:
-            depth = _DepthAway(pack_measured(measured, frame.camera.depth_factor), file)
-        vars(stored).update(
-            index=frame.index, timestamp_s=frame.timestamp_s, camera=frame.camera,
-            _file=file, _image=file.put(pack_image(frame.image_rgb)), _depth=depth,
-        )  # fmt: skip
-        return stored
-
-    @property
-    def image_rgb(self) -> NDArray[np.uint8]:
-        return unpack_image(self._file.get(self._image))
-
-    @property
-    def depth_m(self) -> NDArray[np.float32] | None:
-        return None if self._depth is None else self._depth.get()
-
-
-class StoredPrediction(DepthPrediction):
-    """A prediction whose maps are read and unpacked each time they are asked for.
-
-    A sensor's is what it was to the bit; a network's has been rounded to half precision.
-    """
-
-    _values: _DepthAway
-    _sigma: _DepthAway | None
-
-    def __new__(cls, *args: Any, **fields: Any) -> Any:
-        """A plain prediction: what ``dataclasses.replace`` makes of a stored one."""
-        return DepthPrediction(*args, **fields)
-
-    @classmethod
-    def of(
-        cls, prediction: DepthPrediction, file: NamelessFile, frame: StoredFrame | None, per_m: float
-    ) -> StoredPrediction:
-        """Put the maps of ``prediction`` away in ``file``.
-
-        Args:
-            frame: whose sensor depth the values are; None where they are none's.
-            per_m: units of a sensor per metre.
-        """
-        stored = object.__new__(cls)
-        if frame is not None:
-            values = frame._depth
-        elif prediction.is_sensor:
-            values = _DepthAway(pack_measured(prediction.values, per_m), file)
-        else:
-            values = _DepthAway(pack_predicted(prediction.values), file)
-        sigma = prediction.sigma_log
-        vars(stored).update(
-            kind=prediction.kind, is_sensor=prediction.is_sensor,
-            _values=values, _sigma=None if sigma is None else _DepthAway(pack_predicted(sigma), file),
-        )  # fmt: skip
-        return stored
-
-    @property
-    def values(self) -> NDArray[np.float32]:
-        return self._values.get()
-
-    @property
-    def sigma_log(self) -> NDArray[np.float32] | None:
-        return None if self._sigma is None else self._sigma.get()

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.geometry import invert, transform
-from slamdepth.types import DepthPrediction, Frame
+from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -36,13 +36,13 @@ class MapKeyframe:
     """
 
     id: int
-    frame: Frame
+    frame: StoredFrame
     features: Any
     T_camera_world: Floats
     point_ids: Ints
     log_depth: Floats
     sigma_log: Floats
-    prediction: DepthPrediction | None = None
+    prediction: StoredPrediction | None = None
     predicted_log_depth: Floats = field(default_factory=lambda: np.zeros(0))
     scale: float = 1.0
     velocity: Floats = field(default_factory=lambda: np.zeros(6))

@@ -42,15 +42,15 @@ def fuse_keyframes(
 ) -> Mesh:
     """Fuse the keyframes' depth and colour; returns the surface in the world frame.
 
-    Images and depth are undistorted here. Predicted depth is held to more than measured: what
-    other keyframes contradict is dropped, and a surface must be seen twice.
+    Images and depth are undistorted here. Predicted depth has to pass two more tests than sensor depth: what
+    other keyframes contradict is dropped, and a surface must be seen by two keyframes.
 
     Args:
         keyframes: optimised keyframes.
-        settings: voxel size, depth limit, size of specks to remove.
+        settings: voxel size, depth limit, smallest connected component to keep.
         progress: called with (keyframes done, keyframes in all).
         max_blocks: memory limit, in blocks of 8^3 voxels (10 KB); a map that needs more gets
-            larger voxels and a note that says so.
+            larger voxels and a note.
 
     Returns:
         The mesh, empty and with a note where nothing could be fused. The same keyframes
@@ -71,13 +71,13 @@ def fuse_keyframes(
     if grid.hashmap().size() == 0:
         return Mesh.empty(*notes, "no mesh: no keyframe has depth within the limits")
 
-    # With few keyframes there is no second view to ask for.
+    # few keyframes may have no second view
     is_predicted = not any(keyframe.prediction.is_sensor for keyframe in keyframes)
     least_views = 2 if is_predicted and len(keyframes) > 3 else 1
     raw = grid.extract_triangle_mesh(least_views - 0.5)
     if "indices" not in raw.triangle or len(raw.triangle.indices) == 0:
         return Mesh.empty(*notes, "no mesh: the fused depth holds no surface")
-    vertices, triangles, colors = _without_specks(
+    vertices, triangles, colors = _without_small_components(
         raw.vertex.positions.numpy(),
         raw.triangle.indices.numpy(),
         raw.vertex.colors.numpy(),
@@ -94,7 +94,7 @@ def fuse_keyframes(
 
 
 def _consistent(keyframes: Sequence[Keyframe], settings: MapConfig) -> list[NDArray[np.bool_] | None]:
-    """Thinned masks of the pixels to keep, of predicted keyframes; None for measured ones."""
+    """Subsampled masks of the pixels to keep, for keyframes with predicted depth; None for sensor depth."""
     predicted = [k for k, keyframe in enumerate(keyframes) if not keyframe.prediction.is_sensor]
     views = [
         View.of(
@@ -130,7 +130,7 @@ def _integrated(
         depth = undistorted_depth(trusted_depth(keyframe, settings.max_depth_m), camera)
         mask = keep[k]
         if mask is not None:
-            depth = np.where(_widened(mask, depth.shape), depth, np.float32(0.0))
+            depth = np.where(_upsampled(mask, depth.shape), depth, np.float32(0.0))
         if depth.any():
             truncation = _TRUNCATION_SENSOR if keyframe.prediction.is_sensor else _TRUNCATION_PREDICTED
             color = _undistorted_color(keyframe).astype(np.float32) / np.float32(255.0)
@@ -154,7 +154,7 @@ def _integrated(
 
 
 def undistorted_depth(depth_m: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
-    """Nearest known depth, never mixed: a mean of two surfaces lies on neither."""
+    """Undistort depth ``(H, W)`` by nearest neighbour: a mean of two surfaces lies on neither."""
     if not camera.is_distorted:
         return depth_m
     import cv2
@@ -164,13 +164,13 @@ def undistorted_depth(depth_m: NDArray[np.float32], camera: Camera) -> NDArray[n
 
 
 def _undistorted_color(keyframe: Keyframe) -> NDArray[np.uint8]:
-    camera = keyframe.frame.camera
+    camera, image_rgb = keyframe.frame.camera, keyframe.frame.load().image_rgb
     if not camera.is_distorted:
-        return keyframe.frame.image_rgb
+        return image_rgb
     import cv2
 
     x, y = _undistortion_maps(camera)
-    image = cv2.remap(keyframe.frame.image_rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    image = cv2.remap(image_rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(image, np.uint8)
 
 
@@ -183,20 +183,20 @@ def _undistortion_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.
     return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
 
-def _widened(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """A thinned mask at full size, by nearest pixels."""
+def _upsampled(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Upsample a mask to ``shape`` by nearest neighbour."""
     rows = np.minimum(np.arange(shape[0]) * mask.shape[0] // shape[0], mask.shape[0] - 1)
     columns = np.minimum(np.arange(shape[1]) * mask.shape[1] // shape[1], mask.shape[1] - 1)
-    return mask[rows[:, None], columns]
+    return np.asarray(mask[rows[:, None], columns], bool)
 
 
-def _without_specks(
+def _without_small_components(
     vertices: NDArray[np.float32],
     triangles: NDArray[np.int32],
     colors: NDArray[np.float32],
     min_triangles: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]:
-    """Drop connected components with fewer triangles, and the vertices nothing uses."""
+    """Drop connected components of fewer than ``min_triangles``, and the unused vertices."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -213,12 +213,12 @@ def _without_specks(
 def _ordered(
     vertices: NDArray[np.float32], triangles: NDArray[np.int32], colors: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]:
-    """The mesh in an order of its own: Open3D's depends on its threads."""
+    """Sort vertices and triangles: Open3D's order depends on its threads."""
     order = np.lexsort((*colors.T, *vertices.T))
     rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order), dtype=np.int32)
     triangles = rank[triangles]
-    # Each triangle from its lowest vertex on, which keeps its orientation.
+    # start each triangle at its lowest vertex; its orientation stays
     first = triangles.argmin(axis=1)
     triangles = np.take_along_axis(triangles, (first[:, None] + np.arange(3)) % 3, axis=1)
     triangles = triangles[np.lexsort(triangles.T[::-1])]

@@ -135,7 +135,7 @@ def from_sensor(keyframes: Sequence[Keyframe], frames: Iterable[Frame]) -> Scale
         keyframe = keyframe_of[frame.index]
         u, v = np.rint(keyframe.keypoints_px).astype(np.int64).T
         inside = (u >= 0) & (v >= 0) & (u < sensor_m.shape[1]) & (v < sensor_m.shape[0])
-        theirs, ours = sensor_m[v[inside], u[inside]], keyframe.depth_m[v[inside], u[inside]]
+        theirs, ours = sensor_m[v[inside], u[inside]], keyframe.load_depth_m()[v[inside], u[inside]]
         both = (theirs > 0) & (ours > 0)
         if np.count_nonzero(both) >= _FEWEST_POINTS:
             logs.append(float(np.median(np.log(theirs[both]) - np.log(ours[both]))))

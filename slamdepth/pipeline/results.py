@@ -102,5 +102,5 @@ def score_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore
             logger.debug("keyframe %d is not judged: %s", keyframe.id, error)
             continue
         if sensor_m is not None:
-            scorer.add(keyframe.prediction.values, sensor_m)
+            scorer.add(keyframe.prediction.load().values, sensor_m)
     return scorer.score()

@@ -81,7 +81,7 @@ def keyframe_gallery(keyframes: tuple[Keyframe, ...], count: int = 4) -> Gallery
         return None
     spread = np.linspace(0, len(keyframes) - 1, count).round().astype(int)
     chosen = [keyframes[i] for i in sorted(set(spread.tolist()))]
-    known = np.concatenate([d[np.isfinite(d) & (d > 0)][::16] for d in (k.depth_m for k in chosen)])
+    known = np.concatenate([d[np.isfinite(d) & (d > 0)][::16] for d in (k.load_depth_m() for k in chosen)])
     near_m, far_m = (float(v) for v in np.percentile(known, (1, 98))) if len(known) else (0.0, 1.0)
     start_s = keyframes[0].frame.timestamp_s
     pictures = tuple(_picture(k, start_s, near_m, far_m) for k in chosen)
@@ -89,12 +89,13 @@ def keyframe_gallery(keyframes: tuple[Keyframe, ...], count: int = 4) -> Gallery
 
 
 def _picture(keyframe: Keyframe, start_s: float, near_m: float, far_m: float) -> KeyframePicture:
-    sensor_m = None if keyframe.prediction.is_sensor else keyframe.frame.depth_m
+    frame = keyframe.frame.load()
+    sensor_m = None if keyframe.prediction.is_sensor else frame.depth_m
     return KeyframePicture(
         id=keyframe.id,
-        seconds=keyframe.frame.timestamp_s - start_s,
-        image=_small(keyframe.frame.image_rgb, smooth=True),
-        depth=_small(colour_depth(keyframe.depth_m, near_m, far_m), smooth=False),
+        seconds=frame.timestamp_s - start_s,
+        image=_small(frame.image_rgb, smooth=True),
+        depth=_small(colour_depth(keyframe.load_depth_m(), near_m, far_m), smooth=False),
         sensor=None if sensor_m is None else _small(colour_depth(sensor_m, near_m, far_m), smooth=False),
     )
 

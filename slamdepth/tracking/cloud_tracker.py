@@ -16,13 +16,12 @@ from slamdepth.errors import TrackingError
 from slamdepth.frontend.registration import CloudOdometry, CloudOdometryConfig, depth_to_cloud
 from slamdepth.geometry import invert, project, transform
 from slamdepth.mapping.keyframe import Keyframe
-from slamdepth.mapping.keyframe_store import KeyframeStore
+from slamdepth.mapping.keyframe_store import KeyframeStore, StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.tracking.checks import check_frame, model_for
 from slamdepth.tracking.threads import single_threaded
 from slamdepth.types import (
     Camera,
-    DepthPrediction,
     Frame,
     RunStatistics,
     StepResult,
@@ -36,12 +35,11 @@ _COLUMNS = 160  # points across a cloud, whatever the image's size
 
 @dataclass
 class _Kept:
-    frame: Frame
-    prediction: DepthPrediction | None
+    frame: StoredFrame
+    prediction: StoredPrediction
     T_world_camera: Floats
 
     def final(self, id: int) -> Keyframe:
-        assert self.prediction is not None
         no_features = np.zeros((0, 2))
         return Keyframe(id, self.frame, self.T_world_camera, no_features, 1.0, self.prediction, as_given)
 
@@ -109,7 +107,7 @@ class CloudTracker:
         self._poses.append(T_world_camera)
         is_keyframe = self._overlap(cloud, T_world_camera) < self.config.tracking.keyframe_overlap
         if is_keyframe:
-            self._keyframes.append(_Kept(frame, prediction, T_world_camera))
+            self._keyframes.append(_Kept(StoredFrame(frame), StoredPrediction(prediction), T_world_camera))
             self._store.tidy(self._keyframes)
         return self._result(frame, T_world_camera, len(cloud), is_keyframe, timings)
 

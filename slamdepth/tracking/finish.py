@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -186,7 +185,7 @@ def _final(keyframe: MapKeyframe, mapper: LocalMapper) -> Keyframe:
     assert stored is not None
     in_metres = as_given
     if not stored.is_sensor:
-        prediction = replace(stored)  # read once, should it lie on disk
+        prediction = stored.load()
         coarse = coarse_correction(mapper.depth_field(keyframe, prediction), prediction)
         in_metres = partial(corrected_depth, coarse)
     return Keyframe(

@@ -42,11 +42,11 @@ class HeldBytes:
 def held_bytes(landmarks: LandmarkMap, frames: FrameLog, store: KeyframeStore) -> HeldBytes:
     """What map, frames and images take."""
     return HeldBytes(
-        images=store.held_bytes,
+        images=store.resident_bytes,
         features=sum(array.nbytes for keyframe in landmarks.keyframes for array in _arrays(keyframe)),
         points=sum(array.nbytes for array in _arrays(landmarks)),
         frames=frames.held_bytes,
-        on_disk=store.away_bytes,
+        on_disk=store.spilled_bytes,
     )
 
 

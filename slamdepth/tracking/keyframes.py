@@ -206,7 +206,7 @@ class Keyframes:
     def _give_birth(self, waiting: _Waiting) -> None:
         keyframe = waiting.keyframe
         with self._timed("depth"):
-            prediction = self._depth.take(keyframe.frame)
+            prediction = self._depth.take(keyframe.frame.load())
         with self._timed("mapping"):
             self._follow_motion(keyframe)
             self._mapper.give_birth(keyframe, prediction)

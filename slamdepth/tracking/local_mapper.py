@@ -19,6 +19,7 @@ from slamdepth.depth.alignment import (
 )
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, transform
+from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracking.localiser import Localiser
 from slamdepth.tracking.map_adjuster import Adjustment, MapAdjuster
@@ -72,7 +73,7 @@ class LocalMapper:
         """Make ``frame`` a keyframe of the map with the points it knows; its depth comes later."""
         keyframe = MapKeyframe(
             id=len(self._map.keyframes),
-            frame=frame,
+            frame=StoredFrame(frame),
             features=features,
             T_camera_world=T_camera_world.copy(),
             point_ids=point_ids.copy(),
@@ -103,7 +104,8 @@ class LocalMapper:
             log.warning("keyframe %d: its predicted depth disagrees with the map; not used", keyframe.id)
             prediction = replace(prediction, values=np.zeros_like(prediction.values))
             self.dropped += 1
-        keyframe.prediction = _compact(prediction)
+        compact = _compact(prediction)
+        keyframe.prediction = StoredPrediction(compact)
         features = keyframe.features
         depth, sigma = log_depth_at(prediction, features.raw_px)
         sure = sigma < self._config.depth.max_sigma_log
@@ -112,7 +114,7 @@ class LocalMapper:
         else:
             prior, doubt = prior_log_depth_at(prediction, features.raw_px)
             keyframe.predicted_log_depth = depth
-            field = self.depth_field(keyframe, keyframe.prediction)
+            field = self.depth_field(keyframe, compact)
             there = features.raw_px, np.nan_to_num(prior), np.nan_to_num(doubt, nan=1.0)
             correction = field.mean(*there)
             keyframe.scale = float(np.exp(np.median(correction)))

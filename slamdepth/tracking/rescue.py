@@ -86,7 +86,7 @@ class CloudRescue:
         if keyframe.id not in self._clouds:
             assert keyframe.prediction is not None
             scale = 1.0 if keyframe.prediction.is_sensor else keyframe.scale
-            self._clouds[keyframe.id] = self._cloud(keyframe.prediction.values * np.float32(scale))
+            self._clouds[keyframe.id] = self._cloud(keyframe.prediction.load().values * np.float32(scale))
             for old in [k for k in self._clouds if k <= keyframe.id - 2 * _MAP_KEYFRAMES]:
                 del self._clouds[old]
         return transform(keyframe.T_world_camera, self._clouds[keyframe.id])
