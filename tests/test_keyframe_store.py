@@ -57,7 +57,7 @@ def sensor_keyframe(seed: int) -> Stored:
 
 def predicted_keyframe(seed: int) -> Stored:
     values = (1.0 + np.random.default_rng(seed).random((48, 64))).astype(np.float32)
-    sigma = (0.1 * values).astype(np.float16)
+    sigma: Any = (0.1 * values).astype(np.float16)
     frame = Frame(seed, seed / 30.0, image(seed), CAMERA, gravity=GRAVITY)
     prediction = DepthPrediction(values, DepthKind.METRIC, sigma, gravity=GRAVITY, gravity_share=0.7)
     return Stored(StoredFrame(frame), StoredPrediction(prediction))

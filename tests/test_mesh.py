@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mesh files read back by other people's readers."""
+"""Mesh files, read back by Open3D."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The door to Open3D."""
+"""Importing Open3D."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from slamdepth import open3d_loader
 from slamdepth.errors import SlamdepthError
 
 
-def test_it_opens_in_a_fresh_process_from_many_threads() -> None:
+def test_open3d_is_imported_once_from_many_threads_of_a_fresh_process() -> None:
     code = (
         "from concurrent.futures import ThreadPoolExecutor\n"
         "from slamdepth.open3d_loader import import_open3d\n"

@@ -233,6 +233,6 @@ def test_a_reconstruction_fuses_the_mesh_of_its_keyframes() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"voxel_size_m": 0.0}, {"max_depth_m": -1.0}])
-def test_fusing_with_a_setting_out_of_range_is_a_config_error(wrong: dict[str, float]) -> None:
+def test_fusing_with_a_setting_out_of_range_is_a_config_error(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         reconstruction().fuse_mesh(**wrong)
