@@ -1,191 +1,211 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What predicted depth has to beat, trained here and judged like every other model.
+"""What a depth network has to beat: a constant, the mean depth image, and the dissertation's MLP.
 
-python -m benchmarks.depth_baselines --judge SEQ [SEQ ...] --output runs/depth-baselines
-
-Models: the training median everywhere; the mean depth image; the dissertation's network at
-both of its sizes; the same fully connected layers on the pixels, without the ViT; and any depth
-model by name. A finished training and a finished judgement are not made again.
+The MLP is trained on DINOv2's tokens, as in the dissertation, and on the pixels alone, without a ViT.
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
 import json
-import sys
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress as Bar
+import torch
+from numpy.typing import NDArray
 
-from benchmarks.command import errors_in_one_line
-from benchmarks.depth_baseline_models import ConstantDepth, MeanImageDepth, PixelMlp
-from benchmarks.depth_rows import judged_row, table
 from slamdepth.depth import weights as store
 from slamdepth.depth.base import DepthModel
+from slamdepth.depth.card import ModelCard
 from slamdepth.depth.dinov2 import load_dinov2
-from slamdepth.depth.dinov2_mlp import Dinov2Mlp, read_header, save_mlp
-from slamdepth.depth.registry import create_depth_model
+from slamdepth.depth.dinov2_mlp import SIDE, Dinov2Mlp, MlpHead, at_size, load_mlp, read_header, save_mlp
+from slamdepth.depth.network import NetworkDepth
+from slamdepth.depth.preprocess import focal_px_at, resize_rgb
 from slamdepth.errors import WeightsError
-from slamdepth.training.data import data_folder
 from slamdepth.training.mlp import MlpPairs, MlpSettings, cached_tokens, read_pairs, train_mlp
-from slamdepth.training.progress import Progress, TrainStep
-from slamdepth.training.readers.pairs import PairPlace, PairReader
+from slamdepth.training.progress import Progress, silent
+from slamdepth.training.readers.pairs import PairPlace
+from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
+from slamdepth.typing import Floats32
 
-TRAINED = {
+MLPS = {
     "dinov2-mlp-32": ("tokens", 32),
     "dinov2-mlp-224": ("tokens", 224),
     "pixel-mlp-32": ("pixels", 32),
     "pixel-mlp-224": ("pixels", 224),
 }
-SIMPLE = ("constant", "mean-image")
-LEFT_OUT = "kitchen_kinect"  # the place of a judging sequence
+"""Trained baselines: what they see, and the side of their depth map in pixels."""
+
+BASELINES = ("constant", "mean-image", *MLPS)
+_PIXELS = 3 * SIDE * SIDE
+
+
+class ConstantDepth:
+    """The same depth in metres everywhere."""
+
+    name, kind = "constant", DepthKind.METRIC
+    weights: tuple[WeightsInfo, ...] = ()
+
+    def __init__(self, depth_m: float) -> None:
+        self.depth_m = depth_m
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        """Depth ``(H, W)`` in metres."""
+        return DepthPrediction(np.full(frame.image_rgb.shape[:2], self.depth_m, np.float32), self.kind)
+
+
+class MeanImageDepth:
+    """The mean of the training depth at each place of the image.
+
+    Args:
+        depth_m: ``(S, S)`` metres, seen by a camera of ``focal_px`` at that size.
+    """
+
+    name, kind = "mean-image", DepthKind.METRIC
+    weights: tuple[WeightsInfo, ...] = ()
+
+    def __init__(self, depth_m: Floats32, focal_px: float) -> None:
+        self.depth_m, self.focal_px = depth_m, focal_px
+
+    def predict(self, frame: Frame) -> DepthPrediction:
+        """Depth ``(H, W)`` in metres, scaled to the focal length of the frame."""
+        rows, columns = self.depth_m.shape
+        factor = focal_px_at(frame.camera, rows, columns) / self.focal_px
+        height, width = frame.image_rgb.shape[:2]
+        full = at_size(torch.from_numpy(self.depth_m)[None], height, width)
+        return DepthPrediction(full * np.float32(factor), self.kind)
+
+
+class PixelMlp(NetworkDepth):
+    """The dissertation's fully connected head on the 224 x 224 image itself, without a ViT."""
+
+    def __init__(self, head: MlpHead, focal_px: float, weights: tuple[WeightsInfo, ...] = ()) -> None:
+        card = ModelCard("pixel-mlp", DepthKind.METRIC, (SIDE, SIDE), focal_px, "unknown", "unknown")
+        super().__init__(card, weights)
+        self._head = head
+
+    @classmethod
+    def load(cls, file: Path) -> PixelMlp:
+        """Read a head that ``save_mlp`` wrote.
+
+        Raises:
+            WeightsError: the file is no such head.
+        """
+        head, about = load_mlp(file, features=_PIXELS)
+        info = WeightsInfo(file.stem, store.sha256_of(file), about["trained_on"], about["licence"])
+        return cls(head, float(about["focal_px"]), (info,))
+
+    def infer(self, image_rgb: NDArray[np.uint8]) -> tuple[Floats32, tuple[int, int]]:
+        """Depth ``(H, W)`` in metres for the card's focal length, and the size of the network's input."""
+        height, width = image_rgb.shape[:2]
+        pixels = torch.from_numpy(resize_rgb(image_rgb, SIDE, SIDE).reshape(1, -1)).float()
+        with torch.inference_mode():
+            depth_m = self._head(pixels)
+        return at_size(depth_m, height, width), (SIDE, SIDE)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A model to judge.
+
+    Attributes:
+        make: makes the model, on the first call only.
+        settings: what decides its figures; they are computed again when it changes.
+    """
+
+    make: Callable[[], DepthModel]
+    settings: dict[str, Any]
 
 
 class Baselines:
-    """Fits what is asked for, once, from ``places``."""
+    """Fits the baselines to training pairs, each when it is first judged.
 
-    def __init__(self, places: list[PairPlace], settings: MlpSettings, folder: Path, bar: Bar) -> None:
-        self.places, self.settings, self.folder, self._bar = places, settings, folder, bar
-        self.trained_on = ", ".join(place.name for place in places)
+    Args:
+        places: training pairs.
+        folder: where trained heads are kept; one with the same settings is not trained again.
+        progress: called with the name of a training; returns the function that its steps are passed to.
+    """
+
+    def __init__(
+        self,
+        places: list[PairPlace],
+        settings: MlpSettings,
+        folder: Path,
+        progress: Callable[[str], Progress] = lambda name: silent,
+    ) -> None:
+        self.places, self.settings, self.folder = places, settings, folder
+        self._progress = progress
+
+    def recipe(self, name: str) -> Recipe:
+        """The recipe of one of :data:`BASELINES`."""
+        seen = {"places": self._seen}
+        if name == "constant":
+            return Recipe(functools.cache(self._constant), seen)
+        if name == "mean-image":
+            return Recipe(functools.cache(self._mean_image), seen)
+        return Recipe(functools.cache(lambda: self._trained(name)), {**asdict(self.settings), **seen})
+
+    @property
+    def _seen(self) -> list[str]:
+        return [f"{place.name} {len(place)}" for place in self.places]
 
     @functools.cached_property
-    def pairs(self) -> MlpPairs:
+    def _pairs(self) -> MlpPairs:
         return read_pairs(self.places)
 
     @functools.cached_property
-    def focal_px(self) -> float:
-        """The focal length all depth is brought to: the middle one of the training images."""
-        return float(np.median(self.pairs.focal_px))
+    def _focal_px(self) -> float:
+        """The median focal length of the training images; all depth is scaled to it."""
+        return float(np.median(self._pairs.focal_px))
 
     @functools.cached_property
-    def tokens(self) -> np.ndarray:
+    def _tokens(self) -> NDArray[np.float16]:
         file = store.find_backbone(None)
         sha256, backbone = store.verify(file), load_dinov2(file)
         parts = [
-            cached_tokens(place, backbone, sha256, progress=self._shown(f"tokens of {place.name}"))
+            cached_tokens(place, backbone, sha256, progress=self._progress(f"tokens of {place.name}"))
             for place in self.places
         ]
         return np.concatenate(parts)
 
-    def recipe(self, name: str) -> tuple[Callable[[], DepthModel], dict[str, Any]]:
-        """How to make the model ``name``, once and when it is first judged; and what decides
-        its figures, so that they are made anew when that changes."""
-        places = {"places": [f"{place.name} {len(place)}" for place in self.places]}
-        if name == "constant":
-            return functools.cache(self._constant), places
-        if name == "mean-image":
-            return functools.cache(self._mean_image), places
-        if name in TRAINED:
-            return functools.cache(lambda: self._trained(name)), {**asdict(self.settings), **places}
-        model = create_depth_model(name)
-        return lambda: model, {"weights": [info.sha256 for info in model.weights]}
-
     def _constant(self) -> DepthModel:
-        return ConstantDepth(float(np.median(self.pairs.depth_m[self.pairs.depth_m > 0])))
+        return ConstantDepth(float(np.median(self._pairs.depth_m[self._pairs.depth_m > 0])))
 
     def _mean_image(self) -> DepthModel:
-        depth_m = self.pairs.depth_at(self.focal_px)
+        depth_m = self._pairs.depth_at(self._focal_px)
         count = (depth_m > 0).sum(axis=0)
         mean = depth_m.sum(axis=0) / np.maximum(count, 1)
-        return MeanImageDepth(np.where(count > 0, mean, mean[count > 0].mean()), self.focal_px)
+        filled = np.where(count > 0, mean, mean[count > 0].mean())
+        return MeanImageDepth(filled.astype(np.float32), self._focal_px)
 
     def _trained(self, name: str) -> DepthModel:
-        source, output = TRAINED[name]
+        source, output = MLPS[name]
         settings = replace(self.settings, output=output)
-        said = json.dumps({**asdict(settings), "places": [f"{p.name} {len(p)}" for p in self.places]})
+        described = json.dumps({**asdict(settings), "places": self._seen})
         file = self.folder / f"{name}.safetensors"
-        if not _was_trained(file, said):
-            pixels = self.pairs.image_rgb.reshape(len(self.pairs), -1)
-            features = self.tokens if source == "tokens" else pixels
-            depth_m = self.pairs.depth_at(self.focal_px)
-            head, losses = train_mlp(features, depth_m, settings, progress=self._shown(name))
+        if not _was_trained(file, described):
+            pixels = self._pairs.image_rgb.reshape(len(self._pairs), -1)
+            features = self._tokens if source == "tokens" else pixels
+            depth_m = self._pairs.depth_at(self._focal_px)
+            head, losses = train_mlp(features, depth_m, settings, progress=self._progress(name))
             about = {
-                "trained_on": self.trained_on, "licence": "trained on data for research use",
-                "focal_px": repr(self.focal_px), "settings": said, "losses": json.dumps(losses),
-            }  # fmt: skip
+                "trained_on": ", ".join(place.name for place in self.places),
+                "licence": "trained on data for research use",
+                "focal_px": repr(self._focal_px),
+                "settings": described,
+                "losses": json.dumps(losses),
+            }
             save_mlp(file, head, about)
         return Dinov2Mlp.load(weights=file) if source == "tokens" else PixelMlp.load(file)
 
-    def _shown(self, what: str) -> Progress:
-        task = self._bar.add_task(what)
 
-        def show(step: TrainStep) -> None:
-            described = f"{what}: {step.detail}" if step.detail else what
-            self._bar.update(task, completed=step.done, total=step.total, description=described)
-
-        return show
-
-
-def _thinned(place: PairPlace, stride: int) -> PairPlace:
-    return replace(place, images=place.images[::stride], depths=place.depths[::stride])
-
-
-def _was_trained(file: Path, said: str) -> bool:
+def _was_trained(file: Path, described: str) -> bool:
     if not file.is_file():
         return False
     try:
-        return read_header(file).get("settings") == said
+        return read_header(file).get("settings") == described
     except WeightsError:
         return False
-
-
-@errors_in_one_line
-def main(arguments: list[str]) -> int:
-    """Train, judge, print the table."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.depth_baselines", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("--judge", type=Path, nargs="+", required=True, metavar="DATA")
-    parser.add_argument(
-        "--train", type=Path, nargs="+", metavar="PAIRS",
-        help=f"default: all of $SLAMDEPTH_DATA/depth_training but {LEFT_OUT}",
-    )  # fmt: skip
-    parser.add_argument("--models", nargs="+", default=[*SIMPLE, *TRAINED, "dinov2"], metavar="NAME")
-    parser.add_argument("--output", type=Path, default=Path("runs/depth-baselines"), metavar="DIR")
-    parser.add_argument("--epochs", type=int, default=MlpSettings.epochs)
-    parser.add_argument("--batch", type=int, default=MlpSettings.batch)
-    parser.add_argument("--learning-rate", type=float, default=MlpSettings.learning_rate)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--train-stride", type=int, default=1, metavar="N", help="train on every Nth pair")
-    parser.add_argument("--stride", type=int, help="default: 10 of a sequence, 1 of training pairs")
-    parser.add_argument("--max-frames", type=int)
-    asked = parser.parse_args(arguments)
-    folders = asked.train or [
-        path for path in sorted(data_folder("depth_training").iterdir())
-        if (path / "camera.json").is_file() and path.name != LEFT_OUT
-    ]  # fmt: skip
-    places = [_thinned(PairReader().open(folder), asked.train_stride) for folder in folders]
-    settings = MlpSettings(
-        epochs=asked.epochs, batch=asked.batch, learning_rate=asked.learning_rate, seed=asked.seed
-    )
-    rows = _rows(asked, places, settings)
-    print(table(rows))
-    return 0
-
-
-def _rows(asked: argparse.Namespace, places: list[PairPlace], settings: MlpSettings) -> list[dict[str, Any]]:
-    console = Console(stderr=True)
-    rows = []
-    with Bar(console=console, disable=not console.is_terminal, transient=True) as bar:
-        baselines = Baselines(places, settings, asked.output, bar)
-        for name in asked.models:
-            make, made_with = baselines.recipe(name)
-            for data in asked.judge:
-                file = asked.output / f"{name.replace(':', '_').replace('/', '_')}@{data.resolve().name}.json"
-                rows.append(
-                    judged_row(
-                        file, name, make, data.resolve(), made_with,
-                        stride=asked.stride, max_frames=asked.max_frames,
-                    )
-                )  # fmt: skip
-    return rows
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -1,134 +1,160 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long a depth map takes: by stage for whole models, and the ViT alone in every faster form.
-
-python -m benchmarks.depth_latency --models dinov2 --sizes 224x224 238x322 --repeats 30
-
-The first table has the dissertation's columns (resize, ViT, head) for any model with a DINOv2
-inside. The second runs the backbone as PyTorch eager and in other forms, each with its error
-against eager float32. Medians after a warm-up. Run it on a machine with nothing else to do: the
-file says how busy it was, and CPU time beside wall time shows whether others took the processor.
-"""
+"""Time of a depth prediction by stage: before the ViT, the ViT, after it."""
 
 from __future__ import annotations
 
-import argparse
-import os
-import re
-import sys
-from collections.abc import Callable
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+import numpy as np
+import torch
+from torch import nn
 
-# Read when PyTorch loads; as the command line has it, so that times are those a user gets.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+from benchmarks.markdown import markdown_table
+from slamdepth.datasets import open_dataset
+from slamdepth.depth import weights as store
+from slamdepth.depth.base import DepthModel
+from slamdepth.depth.dinov2 import DinoV2, load_dinov2
+from slamdepth.depth.dinov2_mlp import SIDE, Dinov2Mlp, MlpHead, model_card
+from slamdepth.depth.registry import create_depth_model
+from slamdepth.errors import ConfigError, SlamdepthError
+from slamdepth.types import Camera, Frame
+from slamdepth.typing import Floats
 
-from benchmarks.command import errors_in_one_line
-from benchmarks.depth_latency_stages import stage_row
-from benchmarks.depth_latency_variants import VARIANTS, variant_row
-from benchmarks.summary import environment
-from slamdepth.errors import ConfigError
-from slamdepth.io import write_json
+RANDOM_MLP = {"dinov2-mlp-224": 224, "dinov2-mlp-32": 32}
+"""The dissertation's network at both sizes, with random weights, which do not change its time."""
 
-FORMAT = 1
+STAGES = ("resize_ms", "vit_ms", "head_ms", "together_ms", "cpu_ms")
+_HEADINGS = ("model", "device", "threads", "frame", "resize", "ViT", "head", "together", "CPU time")
 
 
-def parse_size(text: str) -> tuple[int, int]:
-    """``"238x322"`` as rows and columns, multiples of 14.
+def latency_row(
+    name: str, device: str, frames: Sequence[Frame], repeats: int, warm_up: int
+) -> dict[str, Any]:
+    """Milliseconds of each stage of a model with the current number of threads, or the error.
+
+    ``figures`` holds medians, ``spread`` the quartiles.
+    """
+    size = f"{frames[0].camera.height}x{frames[0].camera.width}"
+    about = {"model": name, "device": device, "threads": torch.get_num_threads(), "frame": size}
+    try:
+        times = stage_times(_model(name, device), frames, device, repeats, warm_up)
+    except SlamdepthError as error:
+        return {**about, "error": str(error)}
+    quartiles = np.percentile(times, (25, 50, 75), axis=0)
+    return {
+        **about,
+        "figures": dict(zip(STAGES, quartiles[1].tolist(), strict=True)),
+        "spread": dict(zip(STAGES, quartiles[[0, 2]].T.tolist(), strict=True)),
+    }
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows as Markdown, in milliseconds; ± is half of the distance between the quartiles."""
+    lines = []
+    for row in rows:
+        about = [row["model"], row["device"], str(row["threads"]), row["frame"]]
+        if "error" in row:
+            lines.append([*about, row["error"]])
+            continue
+        halves = {key: (high - low) / 2 for key, (low, high) in row["spread"].items()}
+        lines.append([*about, *(f"{row['figures'][key]:.1f} ±{halves[key]:.1f}" for key in STAGES)])
+    return markdown_table(_HEADINGS, lines)
+
+
+def stage_times(
+    model: DepthModel, frames: Sequence[Frame], device: str, repeats: int, warm_up: int
+) -> Floats:
+    """Milliseconds of ``repeats`` predictions after ``warm_up`` others, ``(repeats, 5)`` as :data:`STAGES`.
+
+    ``resize`` is everything before the ViT (resizing, normalising, moving to the device), ``head``
+    everything after it (head, enlarging to the frame, moving back), ``cpu`` the processor time of all
+    threads for the whole. If a model runs the ViT more than once for an image, these times are added up, and
+    the time in between counts as ``head``.
+
+    Args:
+        frames: predicted in turn.
 
     Raises:
-        ConfigError: it is no such size.
+        ConfigError: the model has no DINOv2 inside.
     """
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
-    rows, columns = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not rows or not columns or rows % 14 or columns % 14:
-        raise ConfigError(f"--sizes {text}: a size is ROWSxCOLUMNS in multiples of 14, as 238x322")
-    return rows, columns
+    vit = vit_of(model)
+    marks: list[float] = []
+
+    def mark(*_: Any) -> None:
+        if device.startswith("cuda"):
+            torch.cuda.synchronize()
+        marks.append(time.perf_counter())
+
+    hooks = [vit.register_forward_pre_hook(mark), vit.register_forward_hook(mark)]
+    rows = []
+    try:
+        for repeat in range(warm_up + repeats):
+            marks.clear()
+            cpu_s = time.process_time()
+            mark()
+            model.predict(frames[repeat % len(frames)])
+            mark()
+            if repeat >= warm_up:
+                vit_s = sum(after - before for before, after in zip(marks[1:-1:2], marks[2::2], strict=True))
+                before_s, whole_s = marks[1] - marks[0], marks[-1] - marks[0]
+                rows.append(
+                    [before_s, vit_s, whole_s - before_s - vit_s, whole_s, time.process_time() - cpu_s]
+                )
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return 1e3 * np.array(rows)
 
 
-def stages_table(rows: list[dict[str, Any]]) -> str:
-    """The dissertation's table, milliseconds."""
-    lines = ["| model | device | threads | resize | ViT | head | together | CPU time |", "| --- " * 8 + "|"]
-    for row in rows:
-        if "failed" in row:
-            lines.append(f"| {row['model']} | {row['device']} | {row['threads']} | {row['failed']} |||||")
-            continue
-        times = (f"{row[key]:.1f}" for key in ("resize_ms", "vit_ms", "head_ms", "together_ms", "cpu_ms"))
-        lines.append(f"| {row['model']} | {row['device']} | {row['threads']} | {' | '.join(times)} |")
-    return "\n".join(lines)
+def vit_of(model: DepthModel) -> DinoV2:
+    """The DINOv2 inside a model.
+
+    Raises:
+        ConfigError: the model has none.
+    """
+    for value in vars(model).values():
+        if isinstance(value, DepthModel):
+            return vit_of(value)
+        if isinstance(value, nn.Module):
+            for module in value.modules():
+                if isinstance(module, DinoV2):
+                    return module
+    raise ConfigError(f"depth model '{model.name}' has no DINOv2 inside, so it has no such stages")
 
 
-def variants_table(rows: list[dict[str, Any]]) -> str:
-    """The ViT's forms; times in milliseconds, error relative to eager float32."""
-    lines = ["| ViT as | device | input | threads | wall ms | CPU ms | error |", "| --- " * 7 + "|"]
-    for row in rows:
-        about = f"| {row['variant']} | {row['device']} | {row['size']} | {row['threads']} | "
-        if "failed" in row:
-            lines.append(f"{about}{row['failed']} |||")
-        else:
-            lines.append(f"{about}{row['wall_ms']:.1f} | {row['cpu_ms']:.1f} | {row['error']:.4f} |")
-    return "\n".join(lines)
+def noise_frame(size: str) -> Frame:
+    """A frame of noise of ``size`` ROWSxCOLUMNS.
+
+    Raises:
+        ConfigError: ``size`` is no such size.
+    """
+    try:
+        rows, columns = (int(part) for part in size.split("x"))
+        camera = Camera(columns, rows, 0.8 * columns, 0.8 * columns, (columns - 1) / 2, (rows - 1) / 2)
+    except (ValueError, SlamdepthError) as error:
+        raise ConfigError(f"--frame {size}: a size is ROWSxCOLUMNS, as 480x640") from error
+    image = np.random.default_rng(0).integers(0, 256, (rows, columns, 3), dtype=np.uint8)
+    return Frame(0, 0.0, image, camera)
 
 
-def measure(
-    asked: argparse.Namespace, tell: Callable[[str], None]
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """All rows that were asked for; one that cannot be is a row that says why."""
-    import torch
+def frames_of(sequence: Path, count: int) -> list[Frame]:
+    """``count`` frames spread evenly over a sequence, without depth.
 
-    sizes = [parse_size(text) for text in asked.sizes]
-    unknown = sorted(set(asked.variants) - set(VARIANTS))
-    if unknown:
-        raise ConfigError(f"--variants {unknown[0]}: choose from: {', '.join(VARIANTS)}")
-    devices = ["cpu", *(["cuda"] if torch.cuda.is_available() and not asked.no_cuda else [])]
-    stages, variants = [], []
-    for device in devices:
-        for threads in asked.threads if device == "cpu" else asked.threads[-1:]:
-            torch.set_num_threads(threads)
-            for name in asked.models:
-                tell(f"{name} on {device}, {threads} threads")
-                stages.append(stage_row(name, device, asked.frame, asked.repeats, asked.warm_up))
-            for rows, columns in sizes:
-                for variant in asked.variants:
-                    tell(f"ViT as {variant} at {rows}x{columns} on {device}, {threads} threads")
-                    variants.append(
-                        variant_row(variant, device, (rows, columns), asked.repeats, asked.warm_up)
-                    )
-    return stages, variants
+    Raises:
+        DatasetError: the folder is no sequence, or a frame cannot be read.
+    """
+    dataset = open_dataset(sequence)
+    indices = np.linspace(0, len(dataset) - 1, min(count, len(dataset))).round().astype(int)
+    return [dataset.read(index) for index in indices.tolist()]
 
 
-@errors_in_one_line
-def main(arguments: list[str]) -> int:
-    """Measure what the command line names and print both tables."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.depth_latency", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument(
-        "--models", nargs="*", default=["dinov2", "dinov2-mlp-224", "dinov2-mlp-32"], metavar="NAME",
-        help="depth models by name; dinov2-mlp-224 and -32 are the dissertation's with random weights",
-    )  # fmt: skip
-    parser.add_argument("--variants", nargs="*", default=list(VARIANTS), metavar="NAME")
-    parser.add_argument("--sizes", nargs="+", default=["224x224", "238x322"], metavar="ROWSxCOLUMNS")
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], metavar="N")
-    parser.add_argument("--repeats", type=int, default=30, metavar="N")
-    parser.add_argument("--warm-up", type=int, default=5, metavar="N")
-    parser.add_argument("--frame", default="480x640", help="size of the camera's image for whole models")
-    parser.add_argument("--no-cuda", action="store_true")
-    parser.add_argument("--output", "-o", type=Path, metavar="FILE", help="write all figures here, as JSON")
-    asked = parser.parse_args(arguments)
-    console = Console(stderr=True)
-    begun = environment()
-    stages, variants = measure(asked, lambda what: console.print(what, style="dim"))
-    if asked.output is not None:
-        settings = {key: value for key, value in vars(asked).items() if key != "output"}
-        about = {"format": FORMAT, "environment": begun, "settings": settings}
-        write_json(asked.output, {**about, "stages": stages, "variants": variants})
-    print(stages_table(stages))
-    print()
-    print(variants_table(variants))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+def _model(name: str, device: str) -> DepthModel:
+    if name not in RANDOM_MLP:
+        return create_depth_model(name, device=device)
+    torch.manual_seed(0)
+    head = MlpHead(RANDOM_MLP[name]).eval().requires_grad_(False)
+    card = model_card({"focal_px": str(float(SIDE))})
+    return Dinov2Mlp(load_dinov2(store.find_backbone(None), device), head, card, (), device)
