@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How memory grows with the length of a sequence, played forth and back as often as needed.
+"""Measure how memory grows with the length of a sequence, which is played forth and back.
 
-python -m benchmarks.memory --data DIR --sequence NAME --depth sensor --frames 5000
+    python -m benchmarks.memory --data DIR --sequence NAME --depth sensor --frames 5000
 
-One line a thousand frames: keyframes, the memory of the process, and what the tracker's arrays
-take by kind. Below: how much a keyframe and a frame add once the images of old keyframes wait
-on disk, and what ten minutes of new ground would need. Played back, a sequence is known ground;
-a walk through new rooms makes keyframes as often as its first play does.
+Prints one line per thousand frames: keyframes, memory of the process, and bytes of the tracker's arrays by
+kind. Below the table: what a keyframe and a frame add once the images of old keyframes are spilled to disk,
+and what ten minutes of unseen ground would need. That figure supposes keyframes as often as in the first
+play: played back, a sequence shows known ground.
 """
 
 from __future__ import annotations
@@ -14,69 +14,110 @@ from __future__ import annotations
 import argparse
 import itertools
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
-from benchmarks.command import errors_in_one_line
+from benchmarks.command import errors_in_one_line, parser_of
 from benchmarks.markdown import markdown_table
-from benchmarks.summary import environment
+from benchmarks.record import environment, write_benchmark
 from benchmarks.worker import memory_mib
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.io import write_json
+from slamdepth.frontend.features import Features
+from slamdepth.frontend.matching import PixelGrid
 from slamdepth.pipeline.run import seed_everything, seed_torch
 from slamdepth.tracking import Tracker
 
-FORMAT = 1
 _MIB = 2**20
 _TEN_MINUTES = 18_000  # frames at 30 Hz
 
 
 @dataclass(frozen=True)
-class Sample:
-    """The tracker after so many frames; sizes in MiB.
+class TrackerMemory:
+    """MiB of a tracker's arrays.
 
     Attributes:
-        resident: memory of the process.
-        images, features, points, seen: arrays in memory; see ``slamdepth.tracking.held.HeldBytes``.
-        on_disk: in the temporary file.
+        images: images and depth maps of keyframes in memory; bounded by ``map.keyframe_memory_mib`` or by
+            eight keyframes, whichever is more.
+        features: keypoints, descriptors and depth priors of keyframes.
+        landmarks: positions, covariances and descriptors of landmarks.
+        observations: what every frame observed.
+        on_disk: images and depth maps spilled to the temporary file.
+    """
+
+    images: float
+    features: float
+    landmarks: float
+    observations: float
+    on_disk: float
+
+    @classmethod
+    def of(cls, tracker: Tracker) -> TrackerMemory:
+        """Add up the arrays in the private parts of ``tracker``, after its threads are done."""
+        tracker._between.wait()
+        landmarks, store = tracker._map, tracker._keyframes.store
+        return cls(
+            images=store.held_bytes / _MIB,
+            features=sum(map(_array_bytes, landmarks.keyframes)) / _MIB,
+            landmarks=_array_bytes(landmarks) / _MIB,
+            observations=tracker._log.held_bytes / _MIB,
+            on_disk=store.away_bytes / _MIB,
+        )
+
+
+def _array_bytes(holder: object) -> int:
+    return sum(array.nbytes for array in _arrays(holder))
+
+
+def _arrays(holder: object) -> Iterator[NDArray[Any]]:
+    for value in vars(holder).values():
+        if isinstance(value, np.ndarray):
+            yield value
+        elif isinstance(value, Features | PixelGrid):
+            yield from _arrays(value)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The tracker and its process after a number of frames.
+
+    Attributes:
+        process_mib: resident memory of the process.
+        tracker: MiB of the tracker's arrays.
     """
 
     frames: int
     keyframes: int
-    resident: float
-    images: float
-    features: float
-    points: float
-    seen: float
-    on_disk: float
+    process_mib: float
+    tracker: TrackerMemory
 
 
 def forth_and_back(count: int) -> Iterator[int]:
-    """``0 .. count-1 .. 0 .. count-1`` for ever; the ends come once."""
+    """``0 .. count-1 .. 0 .. count-1`` without end; the ends come once."""
     if count == 1:
         return itertools.repeat(0)
     return itertools.cycle([*range(count), *range(count - 2, 0, -1)])
 
 
-def sample(tracker: Tracker, frames: int, keyframes: int) -> Sample:
-    """What the tracker and its process hold now."""
-    held = {name: size / _MIB for name, size in asdict(tracker.held()).items()}
-    return Sample(
-        frames, keyframes, memory_mib("VmRSS"), held["images"], held["features"], held["points"],
-        held["frames"], held["on_disk"],
-    )  # fmt: skip
-
-
 def measure(
-    dataset: Dataset, tracker: Tracker, asked: argparse.Namespace, tell: Callable[[Sample], None]
+    dataset: Dataset, tracker: Tracker, asked: argparse.Namespace, report: Callable[[Sample], None]
 ) -> tuple[list[Sample], dict[str, float]]:
-    """Play the sequence and finish; samples on the way, and figures of the end."""
+    """Play the sequence and finish.
+
+    Args:
+        asked: the parsed command line.
+        report: called with each sample.
+
+    Returns:
+        The samples, and the figures of the whole run by name.
+    """
     length = min(len(dataset), asked.length or len(dataset))
     with_depth = asked.depth == "sensor"
     samples: list[Sample] = []
@@ -86,8 +127,8 @@ def measure(
         result = tracker.step(replace(frame, index=n - 1, timestamp_s=(n - 1) / dataset.camera.fps))
         lost += result.T_world_camera is None
         if n == length or n % asked.every == 0 or n == asked.frames:
-            samples.append(sample(tracker, n, result.keyframes))
-            tell(samples[-1])
+            samples.append(Sample(n, result.keyframes, memory_mib("VmRSS"), TrackerMemory.of(tracker)))
+            report(samples[-1])
     done = tracker.finish()
     figures = {
         "lost": lost,
@@ -99,44 +140,49 @@ def measure(
 
 
 def growth(samples: list[Sample], first_play: int) -> dict[str, float]:
-    """What each keyframe and frame adds, and ten minutes of nothing but new ground would need."""
+    """What each keyframe and each frame adds, and what ten minutes of unseen ground would need.
+
+    Args:
+        first_play: frames of the first play, in which all ground is new.
+    """
     first = next(s for s in samples if s.frames >= min(first_play, samples[-1].frames))
     last = samples[-1]
     more = last.keyframes - first.keyframes
-    away = (last.on_disk - first.on_disk) / more if more and first.on_disk else 0.0  # once the budget is full
-    keyframe_mib = (last.features + last.points) / last.keyframes
-    frame_kib = 1024 * last.seen / last.frames
+    is_spilling = more > 0 and first.tracker.on_disk > 0  # the memory budget is used up
+    disk_mib = (last.tracker.on_disk - first.tracker.on_disk) / more if is_spilling else 0.0
+    keyframe_mib = (last.tracker.features + last.tracker.landmarks) / last.keyframes
+    frame_mib = last.tracker.observations / last.frames
     rate = first.keyframes / first.frames
-    without = last.resident - last.images - last.features - last.points - last.seen
-    new_ground = without + max(s.images for s in samples)
-    new_ground += _TEN_MINUTES * (rate * keyframe_mib + frame_kib / 1024)
+    arrays = last.tracker.images + last.tracker.features + last.tracker.landmarks + last.tracker.observations
+    new_ground = last.process_mib - arrays + max(s.tracker.images for s in samples)
+    new_ground += _TEN_MINUTES * (rate * keyframe_mib + frame_mib)
     return {
         "keyframe_mib": keyframe_mib,
-        "keyframe_disk_mib": away,
-        "frame_kib": frame_kib,
+        "keyframe_disk_mib": disk_mib,
+        "frame_kib": 1024 * frame_mib,
         "keyframes_per_frame_of_new_ground": rate,
         "ten_minutes_of_new_ground_mib": new_ground,
     }
 
 
 def table(samples: list[Sample]) -> str:
-    """The samples as a table of a document."""
-    heads = ("frames", "keyframes", "process MiB", "images", "features", "points", "seen", "on disk")
-    return markdown_table(heads, [[f"{value:.0f}" for value in asdict(s).values()] for s in samples])
+    """The samples as Markdown, sizes in MiB."""
+    kinds = [name.replace("_", " ") for name in TrackerMemory.__dataclass_fields__]
+    rows = ((s.frames, s.keyframes, s.process_mib, *asdict(s.tracker).values()) for s in samples)
+    headings = ["frames", "keyframes", "process MiB", *kinds]
+    return markdown_table(headings, [[f"{value:.0f}" for value in row] for row in rows])
 
 
 @errors_in_one_line
-def main(arguments: list[str]) -> int:
-    """Measure what the command line names and print it."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.memory", description=(__doc__ or "").splitlines()[0]
-    )
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    parser = parser_of("memory", __doc__)
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="folder of sequences")
     parser.add_argument("--sequence", required=True, metavar="NAME", help="which of them")
     parser.add_argument("--depth", default="sensor", metavar="MODEL")
-    parser.add_argument("--frames", type=int, default=5000, metavar="N", help="frames to play in all")
-    parser.add_argument("--length", type=int, metavar="N", help="turn back after so many frames")
-    parser.add_argument("--every", type=int, default=1000, metavar="N", help="frames between two lines")
+    parser.add_argument("--frames", type=int, default=5000, metavar="N", help="number of frames to play")
+    parser.add_argument("--length", type=int, metavar="N", help="turn back after N frames")
+    parser.add_argument("--every", type=int, default=1000, metavar="N", help="frames per line")
     parser.add_argument("--budget", type=float, metavar="MIB", help="map.keyframe_memory_mib")
     parser.add_argument("--output", "-o", type=Path, metavar="FILE", help="write all figures here, as JSON")
     asked = parser.parse_args(arguments)
@@ -153,12 +199,11 @@ def main(arguments: list[str]) -> int:
     seed_torch(config.seed)
     samples, figures = measure(
         dataset, Tracker(dataset.camera, model, config), asked,
-        lambda s: console.print(f"{s.frames} frames: {s.resident:.0f} MiB", style="dim"),
+        lambda s: console.print(f"{s.frames} frames: {s.process_mib:.0f} MiB", style="dim"),
     )  # fmt: skip
     if asked.output is not None:
-        chosen = {key: str(value) for key, value in vars(asked).items() if key not in ("data", "output")}
-        about = {"format": FORMAT, "environment": begun, "settings": chosen}
-        write_json(asked.output, {**about, "samples": [asdict(s) for s in samples], "figures": figures})
+        settings = {key: value for key, value in vars(asked).items() if key not in ("data", "output")}
+        write_benchmark(asked.output, begun, settings, samples=[asdict(s) for s in samples], figures=figures)
     print(table(samples))
     print()
     for name, value in figures.items():
@@ -167,4 +212,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

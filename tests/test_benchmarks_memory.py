@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.memory import Sample, forth_and_back, growth, main
+from benchmarks.memory import Sample, TrackerMemory, forth_and_back, growth, main
 
 
 @pytest.mark.parametrize(
@@ -22,8 +22,8 @@ def test_the_ends_come_once(count: int, expected: list[int]) -> None:
 
 def test_growth_is_that_of_new_ground() -> None:
     samples = [
-        Sample(100, 10, resident=220.0, images=20.0, features=1.0, points=1.0, seen=0.5, on_disk=1.0),
-        Sample(400, 20, resident=340.0, images=30.0, features=2.0, points=2.0, seen=2.0, on_disk=4.0),
+        Sample(100, 10, 220.0, TrackerMemory(20.0, 1.0, 1.0, observations=0.5, on_disk=1.0)),
+        Sample(400, 20, 340.0, TrackerMemory(30.0, 2.0, 2.0, observations=2.0, on_disk=4.0)),
     ]
     figures = growth(samples, first_play=100)
     assert figures["keyframe_mib"] == pytest.approx(0.2)
@@ -41,16 +41,18 @@ def test_a_short_run(tiny_room: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     written = json.loads(found.read_text(encoding="utf-8"))
     assert [s["frames"] for s in written["samples"]] == [40, 80, 90]
     assert written["figures"]["lost"] == 0
-    assert written["figures"]["peak_mib"] >= written["samples"][-1]["resident"] > 0
+    assert written["figures"]["peak_mib"] >= written["samples"][-1]["process_mib"] > 0
+    last = written["samples"][-1]["tracker"]
+    assert all(value > 0 for value in last.values()), last
     assert "| 90 | " in capsys.readouterr().out
     assert str(tmp_path) not in found.read_text(encoding="utf-8")
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--data", str(tmp_path), "--sequence", "none"]) != 0
-    told = capsys.readouterr().err
-    assert told.startswith("error: ")
-    assert "none" in told
+    printed = capsys.readouterr().err
+    assert printed.startswith("error: ")
+    assert "none" in printed
     with pytest.raises(SystemExit):
         main(["--data", str(tmp_path), "--sequence", "none", "--frames", "0"])
     assert "--frames must be at least 1" in capsys.readouterr().err
