@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sequence made harder, or another one: mirrored, backwards, small, dark, with gaps.
+"""Corruptions of a sequence: less light, fewer pixels, noise, gaps, occlusion; mirrored or backwards.
 
-What is mirrored or played backwards is a new sequence with a known trajectory; the others are the
-troubles that real recordings have.
+A mirrored or reversed sequence is a new one whose trajectory is known. The others are what real recordings
+suffer.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ def _same(thing: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Disturbance:
-    """What is done to every frame.
+class Corruption:
+    """What is done to every frame of a sequence.
 
     Attributes:
-        camera: of the disturbed frames.
-        pixels: of an image or depth map; its shape follows the camera.
-        light: what happens to a colour image at position n of ``count``.
+        camera: from the original camera to that of the corrupted frames.
+        pixels: from an image or depth map to the corrupted one, of the shape of the new camera.
+        light: from a colour image, its number n and the number of frames to the corrupted image.
         is_dropped: whether frame n is missing.
-        has_depth: whether a sensor's depth of frame n is there; None where nothing is done to it.
-        truth: of the disturbed sequence.
-        backwards: last frame first.
-        laps: how often it is played, one time after the other, with a cut between.
+        has_depth: whether frame n keeps its sensor depth; None keeps all of it.
+        truth: from the true trajectory to that of the corrupted sequence.
+        backwards: the last frame comes first.
+        laps: how often the sequence is played, with a cut between two laps.
     """
 
     camera: Callable[[Camera], Camera] = _same
@@ -52,7 +52,11 @@ class Disturbance:
     laps: int = 1
 
     def play(self, dataset: Dataset, count: int, *, with_depth: bool) -> Iterator[Frame]:
-        """The first ``count`` frames, disturbed, numbered anew; errors as of ``Dataset.read``."""
+        """Read the first ``count`` frames, corrupt them and number them from 0.
+
+        Raises:
+            ImageDecodeError: a frame cannot be read.
+        """
         camera = self.camera(dataset.camera)
         times_s = self._times_s(dataset, count)
         for at in range(self.laps * count):
@@ -67,14 +71,14 @@ class Disturbance:
             yield Frame(at, float(times_s[at]), image, camera, depth_m)
 
     def _times_s(self, dataset: Dataset, count: int) -> NDArray[np.float64]:
-        """When each frame is played, ``(laps * count,)``."""
+        """Timestamps ``(laps * count,)`` of the played frames."""
         times_s = dataset.timestamps_s[:count]
         if self.backwards:
             times_s = -times_s[::-1]
         return np.concatenate([times_s + lap * _lap_s(times_s) for lap in range(self.laps)])
 
     def truth_of(self, dataset: Dataset, count: int) -> Trajectory:
-        """Poses at the times of what :meth:`play` yields of a sequence with ground truth."""
+        """True poses at the times of the frames of :meth:`play`; the sequence has ground truth."""
         assert dataset.ground_truth is not None
         truth = self.truth(dataset.ground_truth)
         if self.laps == 1:
@@ -88,17 +92,17 @@ class Disturbance:
 
 
 def _lap_s(times_s: NDArray[np.float64]) -> float:
-    """From the first frame of a lap to the first of the next, at the sequence's pace."""
+    """Seconds between the first frames of two laps, at the sequence's frame rate."""
     return float(times_s[-1] - times_s[0]) * len(times_s) / max(len(times_s) - 1, 1)
 
 
 def mirrored_truth(truth: Trajectory) -> Trajectory:
-    """Poses in the world mirrored in x."""
+    """Mirror the world and the camera in x."""
     return Trajectory(truth.timestamps_s, _MIRROR @ truth.T_world_camera @ _MIRROR)
 
 
 def backward_truth(truth: Trajectory) -> Trajectory:
-    """The same poses at negative times."""
+    """Reverse the poses; times become negative."""
     return Trajectory(-truth.timestamps_s[::-1], truth.T_world_camera[::-1])
 
 
@@ -125,11 +129,11 @@ def _middle_camera(camera: Camera) -> Camera:
 
 def _noisy(image: NDArray[np.uint8], n: int, grey: float) -> NDArray[np.uint8]:
     noise = np.random.default_rng(n).normal(0.0, grey, image.shape)
-    return np.clip(image + noise, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(image + noise, 0, 255), dtype=np.uint8)
 
 
 def _brighter(image: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
-    return np.clip(image * factor, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(image * factor, 0, 255), dtype=np.uint8)
 
 
 def _black(image: NDArray[np.uint8], now: bool) -> NDArray[np.uint8]:
@@ -137,38 +141,38 @@ def _black(image: NDArray[np.uint8], now: bool) -> NDArray[np.uint8]:
 
 
 def _with_bar(image: NDArray[np.uint8], n: int) -> NDArray[np.uint8]:
-    """A grey bar as wide as half of the image that crosses it from left to right every three seconds."""
+    """Cover half of the width by a grey bar, which crosses the image every three seconds."""
     width = image.shape[1]
     left = (n * width // 60) % (width * 3 // 2) - width // 2
-    out = image.copy()
+    out: NDArray[np.uint8] = image.copy()
     out[:, max(0, left) : max(0, left + width // 2)] = 60
     return out
 
 
-DISTURBANCES: dict[str, Disturbance] = {
-    "as it is": Disturbance(),
-    "mirrored": Disturbance(
+CORRUPTIONS: dict[str, Corruption] = {
+    "as it is": Corruption(),
+    "mirrored": Corruption(
         camera=Camera.mirrored, pixels=lambda pixels: pixels[:, ::-1], truth=mirrored_truth
     ),
-    "backwards": Disturbance(truth=backward_truth, backwards=True),
-    "half the pixels": Disturbance(
+    "backwards": Corruption(truth=backward_truth, backwards=True),
+    "half the pixels": Corruption(
         camera=lambda c: c.scaled(c.width // 2, c.height // 2), pixels=_half
     ),
-    "a view of 70 %": Disturbance(camera=_middle_camera, pixels=_middle),
-    "noise of 10": Disturbance(light=lambda image, n, count: _noisy(image, n, 10.0)),
-    "a quarter of the light": Disturbance(
+    "a view of 70 %": Corruption(camera=_middle_camera, pixels=_middle),
+    "noise of 10": Corruption(light=lambda image, n, count: _noisy(image, n, 10.0)),
+    "a quarter of the light": Corruption(
         light=lambda image, n, count: _noisy(_brighter(image, 0.25), n, 3.0)
     ),
-    "flickering light": Disturbance(light=lambda image, n, count: _brighter(image, 1 + 0.35 * np.sin(n / 4))),
-    "every 15th black": Disturbance(light=lambda image, n, count: _black(image, n % 15 == 7)),
-    "two seconds black": Disturbance(
+    "flickering light": Corruption(light=lambda image, n, count: _brighter(image, 1 + 0.35 * np.sin(n / 4))),
+    "every 15th black": Corruption(light=lambda image, n, count: _black(image, n % 15 == 7)),
+    "two seconds black": Corruption(
         light=lambda image, n, count: _black(image, count // 3 <= n < count // 3 + _BLACK_FRAMES)
     ),
-    "gaps of 8 frames": Disturbance(is_dropped=lambda n: n % 90 >= 82),
-    "every third frame": Disturbance(is_dropped=lambda n: n % 3 > 0),
-    "begun at frame 50": Disturbance(is_dropped=lambda n: n < 50),
-    "three times over": Disturbance(laps=3),
-    "half hidden by a bar": Disturbance(light=lambda image, n, count: _with_bar(image, n)),
-    "depth of 4 in 7 frames": Disturbance(has_depth=lambda n: n % 7 >= 3),
+    "gaps of 8 frames": Corruption(is_dropped=lambda n: n % 90 >= 82),
+    "every third frame": Corruption(is_dropped=lambda n: n % 3 > 0),
+    "begun at frame 50": Corruption(is_dropped=lambda n: n < 50),
+    "three times over": Corruption(laps=3),
+    "half hidden by a bar": Corruption(light=lambda image, n, count: _with_bar(image, n)),
+    "depth of 4 in 7 frames": Corruption(has_depth=lambda n: n % 7 >= 3),
 }  # fmt: skip
-"""By the name in the table."""
+"""Corruptions by their names in the table."""

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many runs from few recordings: sequences begun later and with fewer frames, and what they have in common.
+"""Run slamdepth on sub-sequences of a few recordings and average over them.
 
-python -m benchmarks.sub_sequences SEQ... --starts 0,50,100 --strides 2,3 --set bundle.prior_inflation=9
-python -m benchmarks.sub_sequences SEQ... --disturbance "half hidden by a bar"
+    python -m benchmarks.sub_sequences SEQ... --starts 0,50,100 --strides 2,3 --set bundle.prior_inflation=9
+    python -m benchmarks.sub_sequences SEQ... --corruption "half hidden by a bar"
 
-One run of one sequence moves by a third when anything changes, so it decides nothing. Each cutting has
-other keyframes; the means over all are what a setting is judged by. Predictions are made once a frame and
-kept in --cache, in half precision. Rates are not told: runs may share the machine.
+Any change of a setting moves the error of one run by up to a third, so one run decides nothing.
+Sub-sequences with other first frames or fewer frames have other keyframes; a setting is judged by the means
+over all of them. Each frame is predicted once and kept in --cache, in half precision. Frame rates are not
+measured, since runs may share the machine.
 """
 
 from __future__ import annotations
@@ -24,31 +25,28 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from benchmarks.command import errors_in_one_line
-from benchmarks.corruptions import DISTURBANCES, Disturbance
-from benchmarks.depth_cache import DepthCache, default_cache
+from benchmarks.command import errors_in_one_line, parser_of
+from benchmarks.corruptions import CORRUPTIONS, Corruption
+from benchmarks.depth_cache import CachedDepth, DepthCache, default_cache
 from benchmarks.markdown import markdown_table
-from benchmarks.remembered_depth import RememberedDepth
+from benchmarks.record import environment, write_benchmark
 from benchmarks.robustness import chosen, opened, run
-from benchmarks.summary import environment
 from slamdepth.config import Config, merge
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import ConfigError, DatasetError
-from slamdepth.io import write_json
 
-FORMAT = 1
-_SHORTEST = 20  # frames of a cutting: fewer say little
+_SHORTEST = 20  # frames; the error of fewer says little
 _HEADINGS = ("sequence", "from frame", "every", "tracked %", "ATE SE(3) m", "ATE Sim(3) m", "scale",
              "keyframes", "loops")  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Cutting:
+class SubSequence:
     """Frames ``start``, ``start + stride``, ... of a sequence.
 
     Attributes:
-        settings: nested, as of a settings file.
-        disturbance: what is done to the frames, by its name in ``DISTURBANCES``.
+        settings: nested, as in a settings file.
+        corruption: a name in ``CORRUPTIONS``.
     """
 
     sequence: Path
@@ -57,14 +55,18 @@ class Cutting:
     depth: str
     settings: dict[str, Any]
     cache: Path
-    disturbance: str
+    corruption: str
 
     def config(self) -> Config:
-        """Errors as of ``Config.from_dict``."""
+        """The default settings with those of this sub-sequence.
+
+        Raises:
+            ConfigError: a setting is unknown or out of range.
+        """
         return Config.from_dict(merge({"depth": {"name": self.depth}}, self.settings), origin="--set")
 
-    def _played(self) -> Disturbance:
-        whole = DISTURBANCES[self.disturbance]
+    def _corruption(self) -> Corruption:
+        whole = CORRUPTIONS[self.corruption]
 
         def is_dropped(n: int) -> bool:
             return n < self.start or (n - self.start) % self.stride > 0 or whole.is_dropped(n)
@@ -72,24 +74,24 @@ class Cutting:
         return replace(whole, is_dropped=is_dropped)
 
     def figures(self) -> dict[str, Any]:
-        """Its row of the file: a run's figures, or why there are none."""
+        """Run it: its row of the file, with the figures or the error."""
         dataset = opened(self.sequence)
         model = create_depth_model(self.depth)
         if self.depth != "sensor":
-            cache = self.cache / "with_sigma" / self.disturbance.replace(" ", "_")
-            model = RememberedDepth(model, DepthCache.of(cache, dataset, model))
+            cache = self.cache / "with_sigma" / self.corruption.replace(" ", "_")
+            model = CachedDepth(model, DepthCache.of(cache, dataset, model))
         try:
-            figures = run(dataset, self._played(), self.config(), len(dataset), model)
+            figures = run(dataset, self._corruption(), self.config(), len(dataset), model)
         except DatasetError as error:  # too few poses to score; the other rows go on
             figures = {"error": str(error)}
         return {"sequence": dataset.name, "start": self.start, "stride": self.stride, **figures}
 
 
-def cuttings(asked: argparse.Namespace) -> list[Cutting]:
-    """Each start with every frame, and the first start with fewer; those too short are left out.
+def sub_sequences(asked: argparse.Namespace) -> list[SubSequence]:
+    """Each start with stride 1, and the first start with each stride; short ones are left out.
 
     Raises:
-        DatasetError: a sequence is none, or has no ground truth.
+        DatasetError: a folder is no sequence, or has no ground truth.
     """
     found = []
     for path in asked.sequences:
@@ -98,7 +100,7 @@ def cuttings(asked: argparse.Namespace) -> list[Cutting]:
             continue
         wanted = [*((start, 1) for start in asked.starts), *((asked.starts[0], n) for n in asked.strides)]
         found += [
-            Cutting(path, start, stride, asked.depth, asked.settings, asked.cache, asked.disturbance)
+            SubSequence(path, start, stride, asked.depth, asked.settings, asked.cache, asked.corruption)
             for start, stride in dict.fromkeys(wanted)
             if (len(dataset) - start) // stride >= _SHORTEST
         ]
@@ -106,7 +108,7 @@ def cuttings(asked: argparse.Namespace) -> list[Cutting]:
 
 
 def means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Over the runs that were scored: geometric means of errors, mean size of the scale's logarithm."""
+    """Average the scored runs: geometric means of errors, the mean of ``abs(log(scale))``."""
     good = [row for row in rows if "error" not in row]
     if not good:
         return {"runs": 0, "failed": len(rows)}
@@ -121,7 +123,7 @@ def means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """A row a run; a failed one says why."""
+    """One row for each run as Markdown; the row of a failed run holds its error."""
     return markdown_table(_HEADINGS, [_cells(row) for row in rows])
 
 
@@ -136,7 +138,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def in_words(found: dict[str, Any]) -> str:
-    """One line of :func:`means`."""
+    """The result of :func:`means` as one line."""
     if not found["runs"]:
         return f"no run could be scored, {found['failed']} failed"
     failed = f", {found['failed']} failed" if found["failed"] else ""
@@ -160,11 +162,8 @@ def _setting(text: str) -> dict[str, Any]:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.sub_sequences",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    """The command line."""
+    parser = parser_of("sub_sequences", __doc__)
     parser.add_argument("sequences", nargs="+", type=Path, metavar="SEQ", help="with ground truth")
     parser.add_argument("--starts", type=_whole_numbers, metavar="N,...", default=[0, 30, 60, 100, 200, 400],
                         help="first frames (default: 0,30,60,100,200,400)")  # fmt: skip
@@ -173,8 +172,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--depth", default="dinov2", help="'sensor' or a depth model (default: dinov2)")
     parser.add_argument("--set", type=_setting, action="append", default=[], dest="settings",
                         metavar="SECTION.KEY=VALUE", help="a setting; can be repeated")  # fmt: skip
-    parser.add_argument("--disturbance", default="as it is", metavar="NAME",
-                        help="of benchmarks.robustness, done to every cutting")  # fmt: skip
+    parser.add_argument("--corruption", default="as it is", metavar="NAME",
+                        help="one of benchmarks.robustness, for every sub-sequence")  # fmt: skip
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs at once (default: 1)")
     parser.add_argument("--cache", type=Path, metavar="DIR", help="folder for predictions")
     parser.add_argument("--output", "-o", type=Path, metavar="FILE", help="write the figures as JSON")
@@ -197,24 +196,22 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     asked, begun = parse(arguments), environment()
-    chosen(asked.disturbance)
-    wanted = cuttings(asked)
+    chosen([asked.corruption])
+    wanted = sub_sequences(asked)
     if not wanted:
-        raise ConfigError(f"no cutting has {_SHORTEST} frames and the depth that was asked for")
-    wanted[0].config()  # a wrong setting is told before any work
+        raise ConfigError(f"no sub-sequence has {_SHORTEST} frames and the depth that was asked for")
+    wanted[0].config()  # a wrong setting fails before any work
+    settings = {key: getattr(asked, key) for key in ("depth", "corruption", "settings")}
     rows: list[dict[str, Any]] = []
     with (
         ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool,
         Console(stderr=True).status("") as status,
     ):
-        for row in pool.map(Cutting.figures, wanted):
+        for row in pool.map(SubSequence.figures, wanted):
             rows.append(row)
             status.update(f"{len(rows)} of {len(wanted)} runs: {row['sequence']} from {row['start']} done")
             if asked.output:
-                write_json(asked.output, {"format": FORMAT, "environment": begun, "depth": asked.depth,
-                                          "disturbance": asked.disturbance,
-                                          "settings": asked.settings, "rows": rows,
-                                          "means": means(rows)})  # fmt: skip
+                write_benchmark(asked.output, begun, settings, rows=rows, means=means(rows))
     print(table(rows))
     print(f"\n{in_words(means(rows))}")
     return 0

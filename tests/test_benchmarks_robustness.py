@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark of disturbed sequences: what is disturbed stays a sequence of its camera and its truth."""
+"""The robustness benchmark: corrupted frames agree with their camera and their ground truth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from made_up import MadeUpDataset, pose
 
-from benchmarks.corruptions import DISTURBANCES, mirrored_truth
+from benchmarks.corruptions import CORRUPTIONS, mirrored_truth
 from benchmarks.robustness import main
 from slamdepth.geometry import se3_exp
 from slamdepth.types import Camera, Trajectory
@@ -44,12 +44,12 @@ def made_up(count: int = 100) -> MadeUpDataset:
     return dataset
 
 
-@pytest.mark.parametrize("name", DISTURBANCES)
+@pytest.mark.parametrize("name", CORRUPTIONS)
 def test_frames_are_of_their_camera_and_time_goes_on(name: str) -> None:
-    dataset, disturbance = made_up(), DISTURBANCES[name]
-    camera = disturbance.camera(dataset.camera)
-    frames = list(disturbance.play(dataset, 100, with_depth=True))
-    truth = disturbance.truth_of(dataset, 100)
+    dataset, corruption = made_up(), CORRUPTIONS[name]
+    camera = corruption.camera(dataset.camera)
+    frames = list(corruption.play(dataset, 100, with_depth=True))
+    truth = corruption.truth_of(dataset, 100)
     assert (np.diff([f.timestamp_s for f in frames]) > 0).all()
     assert (np.diff(truth.timestamps_s) > 0).all()
     for frame in frames:
@@ -65,20 +65,20 @@ def test_frames_are_of_their_camera_and_time_goes_on(name: str) -> None:
 
 def test_what_is_taken_away() -> None:
     dataset = made_up()
-    dropped = list(DISTURBANCES["gaps of 8 frames"].play(dataset, 100, with_depth=False))
+    dropped = list(CORRUPTIONS["gaps of 8 frames"].play(dataset, 100, with_depth=False))
     assert [f.index for f in dropped] == [*range(82), *range(90, 100)]
-    third = list(DISTURBANCES["every third frame"].play(dataset, 10, with_depth=False))
+    third = list(CORRUPTIONS["every third frame"].play(dataset, 10, with_depth=False))
     assert [f.index for f in third] == [0, 3, 6, 9]
-    later = list(DISTURBANCES["begun at frame 50"].play(dataset, 53, with_depth=False))
+    later = list(CORRUPTIONS["begun at frame 50"].play(dataset, 53, with_depth=False))
     assert [f.index for f in later] == [50, 51, 52]
-    black = list(DISTURBANCES["two seconds black"].play(dataset, 100, with_depth=False))
+    black = list(CORRUPTIONS["two seconds black"].play(dataset, 100, with_depth=False))
     assert [f.index for f in black[1:] if not f.image_rgb.any()] == list(range(33, 93))
-    sparse = list(DISTURBANCES["depth of 4 in 7 frames"].play(dataset, 14, with_depth=True))
+    sparse = list(CORRUPTIONS["depth of 4 in 7 frames"].play(dataset, 14, with_depth=True))
     assert sum(f.depth_m is not None for f in sparse) == 8
 
 
 def test_laps_follow_one_another_at_the_pace_of_the_sequence() -> None:
-    dataset, laps = made_up(), DISTURBANCES["three times over"]
+    dataset, laps = made_up(), CORRUPTIONS["three times over"]
     frames, truth = list(laps.play(dataset, 40, with_depth=False)), laps.truth_of(dataset, 40)
     assert [f.index for f in frames] == list(range(120))
     step_s = dataset.timestamps_s[1] - dataset.timestamps_s[0]
@@ -89,11 +89,11 @@ def test_laps_follow_one_another_at_the_pace_of_the_sequence() -> None:
 
 
 def test_a_short_run(tiny_room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = tmp_path / "disturbed.json"
-    wanted = ["--depth", "sensor", "--disturbances", "mirrored,backwards", "--max-frames", "30"]
+    found = tmp_path / "robustness.json"
+    wanted = ["--depth", "sensor", "--corruptions", "mirrored,backwards", "--max-frames", "30"]
     assert main([str(tiny_room), *wanted, "--output", str(found)]) == 0
     rows = json.loads(found.read_text(encoding="utf-8"))["rows"]
-    assert [row["disturbance"] for row in rows] == ["mirrored", "backwards"]
+    assert [row["corruption"] for row in rows] == ["mirrored", "backwards"]
     for row in rows:
         assert row["tracked"] == 1.0
         assert row["ate_se3_m"] < 0.02
@@ -102,7 +102,7 @@ def test_a_short_run(tiny_room: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_bad_input_is_one_line(tiny_room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(tiny_room), "--disturbances", "none"]) != 0
-    assert "no disturbance 'none'; there are: as it is, mirrored" in capsys.readouterr().err
+    assert main([str(tiny_room), "--corruptions", "none"]) != 0
+    assert "no corruption 'none'; there are: as it is, mirrored" in capsys.readouterr().err
     assert main([str(tmp_path / "nowhere")]) != 0
     assert capsys.readouterr().err.startswith("error: ")
