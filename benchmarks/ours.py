@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""slamdepth as a system under test: its tracker, without files, mesh and report."""
+"""slamdepth as a system under test: the tracker alone, without files, mesh and report."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from slamdepth.types import Camera, Frame
 
 
 class SlamDepth:
-    """What ``slamdepth run --no-mesh`` does to each frame; the network runs live.
+    """Tracks as ``slamdepth run --no-mesh`` does; the network runs in the measured time.
 
     Args:
-        model: in place of the one that ``config`` names.
+        model: used instead of the depth model that ``config`` names.
 
     Raises:
-        WeightsError: the weights of the depth model are not there.
+        WeightsError: the weights of the depth model are missing.
     """
 
     def __init__(self, camera: Camera, config: Config, model: DepthModel | None = None) -> None:
@@ -32,10 +32,15 @@ class SlamDepth:
         self._tracker = create_tracker(camera, model, config)
 
     def step(self, frame: Frame) -> None:
+        """Track the next frame."""
         self._tracker.step(frame)
 
     def finish(self) -> Estimate:
-        """The reconstruction's poses; errors as ``Tracker.finish``."""
+        """Optimise the map and hand over the poses.
+
+        Raises:
+            TrackingError: no frame was tracked.
+        """
         done = self._tracker.finish()
         counts = {
             "keyframes": len(done.keyframes),

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Place recognition on real sequences: the bag of words, DINOv2, and what the tracker verifies.
+"""Place recognition on real sequences: bag of words, DINOv2 tokens, and the tracker's verification.
 
     python -m benchmarks.places --data DIR --sequences rgbd_dataset_freiburg1_desk --output places.json
 
-Every frame asks which earlier one shows the same place; true poses and depth say who is right.
-See ``docs/benchmarks.md`` for how to read the table.
+Every frame is a query for earlier frames of the same place; true poses and depth say which answers are
+right. See ``docs/benchmarks.md`` for the columns of the table.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks import places_methods as methods
-from benchmarks.command import errors_in_one_line
+from benchmarks.command import comma_separated, errors_in_one_line, parser_of, progress_line
 from benchmarks.markdown import markdown_table
 from benchmarks.places_scores import score_answers
 from benchmarks.places_truth import labels, overlaps
-from benchmarks.slam import find_sequences, tell
-from benchmarks.summary import FORMAT, environment
+from benchmarks.record import environment, write_benchmark
+from benchmarks.slam import find_sequences
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import ConfigError, DatasetError
-from slamdepth.io import write_json, write_text
+from slamdepth.io import write_text
+from slamdepth.typing import Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -48,7 +49,7 @@ _COLUMNS = (
 
 
 def read_places(dataset: Dataset, stride: int, max_frames: int | None, config: Config) -> list[methods.Place]:
-    """Every ``stride``-th frame that has a true pose and depth; with tokens where the backbone is there.
+    """Read every ``stride``-th frame that has a true pose and depth, with DINOv2's tokens if it is there.
 
     Raises:
         DatasetError: there is no ground truth, or fewer than two such frames.
@@ -66,14 +67,14 @@ def read_places(dataset: Dataset, stride: int, max_frames: int | None, config: C
         frame = dataset.read(index, with_depth=dataset.has_depth)
         if dataset.has_depth and frame.depth_m is None:
             continue
-        patches, classes = tokens.of(frame.image_rgb) if tokens else ((), ())
+        means, classes = tokens.of(frame.image_rgb) if tokens else ((), ())
         places.append(
             methods.Place(
                 frame,
                 methods.features_of(frame, config),
                 model.predict(frame),
                 truth.T_world_camera[nearest],
-                patches,
+                means,
                 classes,
             )
         )
@@ -83,7 +84,7 @@ def read_places(dataset: Dataset, stride: int, max_frames: int | None, config: C
 
 
 class _Tokens:
-    """DINOv2's tokens of an image, as a keyframe's depth has them already."""
+    """DINOv2's tokens of an image; predicting a keyframe's depth makes them in any case."""
 
     def __init__(self, backbone: Any) -> None:
         from slamdepth.depth.dinov2 import working_type
@@ -93,7 +94,7 @@ class _Tokens:
 
     @classmethod
     def load(cls) -> _Tokens | None:
-        """None, and a line on stderr, where the backbone is not there."""
+        """Load the backbone; None, and a line on standard error, where its weights are missing."""
         from slamdepth.depth.dinov2 import load_dinov2
         from slamdepth.depth.weights import find_backbone
         from slamdepth.errors import WeightsError
@@ -101,13 +102,11 @@ class _Tokens:
         try:
             return cls(load_dinov2(find_backbone()))
         except WeightsError as error:
-            tell(f"without DINOv2's rows: {error}")
+            progress_line(f"without DINOv2's rows: {error}")
             return None
 
-    def of(
-        self, image_rgb: NDArray[np.uint8]
-    ) -> tuple[tuple[methods.Floats, ...], tuple[methods.Floats, ...]]:
-        """Patch tokens ``(P, 384)`` and class token ``(384,)`` after each of the taps, unit length."""
+    def of(self, image_rgb: NDArray[np.uint8]) -> tuple[tuple[Floats32, ...], tuple[Floats32, ...]]:
+        """The mean of the normalised patch tokens and the class token, ``(384,)``, after each of the taps."""
         import torch
 
         from slamdepth.depth.preprocess import input_size, normalised, resize_rgb
@@ -116,16 +115,15 @@ class _Tokens:
         image = normalised(resize_rgb(image_rgb, rows, columns)[None], "cpu")
         with torch.inference_mode():
             tapped = self._backbone(image.to(self._dtype), methods.TAPS)
-        patches = tuple(_unit(grid[0].flatten(1).T.float().numpy()) for grid, _ in tapped)
-        return patches, tuple(_unit(token.float().numpy())[0] for _, token in tapped)
-
-
-def _unit(rows: methods.Floats) -> methods.Floats:
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+        means = tuple(
+            torch.nn.functional.normalize(grid[0].flatten(1).float(), dim=0).mean(dim=1).numpy()
+            for grid, _ in tapped
+        )
+        return means, tuple(token[0].float().numpy() for _, token in tapped)
 
 
 def earlier_frames(timestamps_s: Sequence[float], apart_s: float) -> dict[int, list[int]]:
-    """Of each frame those that came at least ``apart_s`` before; frames without any are left out."""
+    """For each frame the frames at least ``apart_s`` older; frames without any are left out."""
     found = {q: [k for k in range(q) if t - timestamps_s[k] >= apart_s] for q, t in enumerate(timestamps_s)}
     return {q: frames for q, frames in found.items() if frames}
 
@@ -133,27 +131,20 @@ def earlier_frames(timestamps_s: Sequence[float], apart_s: float) -> dict[int, l
 def answerers(
     places: Sequence[methods.Place], dataset: Dataset, config: Config, min_gap: int
 ) -> Iterator[tuple[str, methods.Answer]]:
-    """The rows of the table."""
-    bag = methods.bag_of_words(places)
-    yield "bag of ORB words", bag
-    if places[0].patches:
+    """The methods of the table by their names in it."""
+    yield "bag of ORB words", methods.bag_of_words(places)
+    if places[0].means:
         for t, tap in enumerate(methods.TAPS):
             yield f"DINOv2 class token, block {tap}", methods.vectors([p.classes[t] for p in places])
         for t, tap in enumerate(methods.TAPS):
-            means = [p.patches[t].mean(axis=0) for p in places]
-            yield f"DINOv2 mean patch token, block {tap}", methods.vectors(means)
-        for t, tap in enumerate(methods.TAPS):
-            again = methods.reranked(places, t, bag, with_bag=False)
-            yield f"bag's first {methods.RERANKED} by DINOv2 patches, block {tap}", again
-        both = methods.reranked(places, 0, bag, with_bag=True)
-        yield f"the same times the bag's score, block {methods.TAPS[0]}", both
+            yield f"DINOv2 mean patch token, block {tap}", methods.vectors([p.means[t] for p in places])
     yield "bag, verified as by the tracker", methods.verified(places, dataset.camera, config, min_gap)
 
 
 def judge(
     name: str, dataset: Dataset, *, stride: int, max_frames: int | None, apart_s: float
 ) -> list[dict[str, Any]]:
-    """The rows of one sequence."""
+    """The rows of one sequence, one for each method."""
     config = Config()
     places = read_places(dataset, stride, max_frames, config)
     depth = "sensor" if dataset.has_depth else "predicted"
@@ -198,16 +189,14 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.places", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = parser_of("places", __doc__)
     add = parser.add_argument
     add("--data", type=Path, required=True, help="folder that holds the sequences")
-    add("--sequences", help="their names, with commas (default: all in --data)")
-    add("--stride", type=int, default=10, help="every so many frames one is taken")
+    add("--sequences", type=comma_separated, help="their names, with commas (default: all in --data)")
+    add("--stride", type=int, default=10, help="take every Nth frame")
     add("--max-frames", type=int)
-    add("--apart", type=float, default=3.0, metavar="S", help="seconds a frame must be older to be an answer")
-    add("--output", type=Path, help=".json to write; table (.md) and plot (.svg) go beside it")
+    add("--apart", type=float, default=3.0, metavar="S", help="an answer is at least S seconds older")
+    add("--output", type=Path, help=".json to write; table (.md) and plot (.svg) get the same name")
     return parser.parse_args(arguments)
 
 
@@ -217,11 +206,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     if options.stride < 1 or options.apart < 0:
         raise ConfigError("--stride must be at least 1 and --apart no less than 0")
-    names = [name.strip() for name in options.sequences.split(",")] if options.sequences else None
     begun = environment()
     rows: list[dict[str, Any]] = []
-    for name, dataset in find_sequences(options.data, names).items():
-        tell(f"{name}: reading every {options.stride}th frame")
+    for name, dataset in find_sequences(options.data, options.sequences).items():
+        progress_line(f"{name}: reading every {options.stride}th frame")
         rows += judge(
             name, dataset,
             stride=options.stride, max_frames=options.max_frames, apart_s=options.apart,
@@ -232,13 +220,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _write(options: argparse.Namespace, begun: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
+def _write(options: argparse.Namespace, begun: dict[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
     from benchmarks.places_plot import write_precision_recall
 
     settings = {"stride": options.stride, "max_frames": options.max_frames, "apart_s": options.apart}
-    write_json(
-        options.output, {"format": FORMAT, "environment": begun, "settings": settings, "rows": list(rows)}
-    )
+    write_benchmark(options.output, begun, settings, rows=rows)
     write_text(options.output.with_suffix(".md"), table(rows) + "\n")
     write_precision_recall(options.output.with_suffix(".svg"), rows)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Precision over recall, a panel a sequence."""
+"""A plot of precision over recall, one panel for each sequence."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from benchmarks.tables import by_sequence
 
 
 def write_precision_recall(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """A curve a method; a method that accepts at one score only is a dot."""
+    """Draw one curve for each method; a method with a single score is a dot."""
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the answers to every query to precision and recall."""
+"""Precision and recall of the answers to all queries."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Answers = Sequence[tuple[int, float]]
-"""Of one query: earlier frames and their scores, best first."""
+"""The answer to one query: earlier frames and their scores, best first."""
 
 
 @dataclass(frozen=True)
 class PlaceScore:
-    """How good a method's answers are.
+    """How good the answers of a method are.
 
-    A query's first answer is accepted from some score on. Precision is the share of right
-    ones among the accepted, recall the share of queries that accept a right one among those
-    whose place was seen before. Answers that count neither way are passed over.
+    The first answer to a query is accepted above a threshold of its score. Precision is the share of right
+    answers among the accepted; recall is the share of the queries with a known place whose accepted answer
+    is right. Answers labelled -1 are ignored.
 
     Attributes:
-        queries, known: queries in all, and those whose place was seen before.
+        queries, known: all queries, and those whose place an earlier frame shows.
         average_precision: precision averaged over recall.
-        recall_at_full_precision: recall at the score above which no answer is wrong.
-        recall_at_1, recall_at_5: share of the known queries with a right one among the first.
-        curve: ``(P, 2)`` recall and precision, from the highest score down.
+        recall_at_full_precision: recall at the lowest threshold above which no answer is wrong.
+        recall_at_1, recall_at_5: share of the known queries with a right answer among the first 1 and 5.
+        curve: ``(P, 2)`` recall and precision, from the highest threshold down.
     """
 
     queries: int
@@ -44,12 +44,12 @@ class PlaceScore:
 def score_answers(
     answers: Mapping[int, Answers], labels: NDArray[np.int8], earlier: Mapping[int, Sequence[int]]
 ) -> PlaceScore:
-    """Judge the answers to all queries.
+    """Score the answers to all queries.
 
     Args:
-        answers: of each query; one without answers has none to be wrong.
-        labels: ``(N, N)``; see ``places_truth.labels``.
-        earlier: the frames each query may be answered with.
+        answers: for each query; empty where a method has none.
+        labels: ``(N, N)``, 1 for one place, 0 for two, -1 for pairs that are ignored.
+        earlier: the frames that each query may be answered with.
     """
     known = {q for q, frames in earlier.items() if any(labels[q, k] == 1 for k in frames)}
     ranked = {q: [(k, s) for k, s in answers[q] if labels[q, k] >= 0] for q in earlier}
@@ -74,7 +74,7 @@ def score_answers(
 
 
 def _curve(first: list[tuple[float, bool]], known: int) -> NDArray[np.float64]:
-    """Recall and precision at every score that occurs; equal scores are accepted together."""
+    """Recall and precision at every threshold; equal scores are accepted together."""
     if not first or known == 0:
         return np.zeros((0, 2))
     score = np.array([s for s, _ in first])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which frames really show the same place: how much of one is seen in the other."""
+"""Ground truth of place recognition: how much of one frame is visible in another."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _STEP_PX = 16
 def overlaps(
     camera: Camera, depths_m: Sequence[NDArray[np.floating]], T_world_camera: Floats, *, tolerance: float
 ) -> Floats:
-    """``(N, N)`` overlap of all pairs of frames: the mean of what either sees of the other.
+    """Overlap ``(N, N)`` of all pairs of frames, the mean over both directions.
 
-    A pixel of one frame is seen in the other where it falls into the image and nothing is in
-    front of it; where the other's depth is unknown it counts as seen.
+    A pixel of one frame is visible in the other if it projects into the image and nothing is in front of
+    it. Where the other frame has no depth, it counts as visible.
 
     Args:
         depths_m: N images ``(H, W)``, metres along z, 0 = unknown.
         T_world_camera: ``(N, 4, 4)`` true poses.
-        tolerance: relative depth by which a point may lie behind what the other measured.
+        tolerance: relative depth by which a point may lie behind the measured surface.
     """
     pinhole = camera.without_distortion()
     rows = np.arange(_STEP_PX // 2, camera.height, _STEP_PX)
@@ -51,7 +51,8 @@ def overlaps(
         for a, cloud in enumerate(clouds):
             if len(cloud):
                 seen[a, b] = _share_seen(pinhole, transform(T_b_world, cloud), depth_m, tolerance)
-    return 0.5 * (seen + seen.T)
+    overlap: Floats = 0.5 * (seen + seen.T)
+    return overlap
 
 
 def _share_seen(camera: Camera, points_c: Floats, depth_m: NDArray[np.floating], tolerance: float) -> float:
@@ -64,7 +65,7 @@ def _share_seen(camera: Camera, points_c: Floats, depth_m: NDArray[np.floating],
 
 
 def labels(overlap: Floats) -> NDArray[np.int8]:
-    """1 for one place, 0 for two, -1 for what counts neither way."""
+    """1 for one place, 0 for two, -1 for pairs in between, which are ignored."""
     found = np.full(overlap.shape, -1, dtype=np.int8)
     found[overlap >= SAME] = 1
     found[overlap < DIFFERENT] = 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy against speed, a panel a sequence."""
+"""A plot of accuracy over speed, one panel for each sequence."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MARKERS = "osD^vPX*<>ph"
 
 
 def write_plot(path: Path, benchmark: Mapping[str, Any]) -> bool:
-    """ATE Sim(3) over frames per second; medians, bars from the least to the most.
+    """Draw ATE Sim(3) over frames per second: medians, with bars from the least to the most.
 
     Returns:
         False, and no file, where no row has both figures.
@@ -37,12 +37,12 @@ def write_plot(path: Path, benchmark: Mapping[str, Any]) -> bool:
     )
     for axis, (sequence, rows) in zip(axes[0], panels.items(), strict=True):
         for row in rows:
-            fps, ate = row["figures"]["fps"], row["figures"]["ate_sim3_m"]
+            (fps, fps_bar), (ate, ate_bar) = (_with_bar(row, key) for key in ("fps", "ate_sim3_m"))
             axis.errorbar(
-                fps["median"],
-                ate["median"],
-                xerr=[[fps["median"] - fps["min"]], [fps["max"] - fps["median"]]],
-                yerr=[[ate["median"] - ate["min"]], [ate["max"] - ate["median"]]],
+                fps,
+                ate,
+                xerr=fps_bar,
+                yerr=ate_bar,
                 marker=_MARKERS[labels.index(row["label"]) % len(_MARKERS)],
                 color=f"C{depths.index(row['depth']) % 10}",
                 linestyle="none",
@@ -55,3 +55,10 @@ def write_plot(path: Path, benchmark: Mapping[str, Any]) -> bool:
     figure.savefig(path)
     plt.close(figure)
     return True
+
+
+def _with_bar(row: Mapping[str, Any], key: str) -> tuple[float, list[list[float]]]:
+    """The median, and how far below and above it the extremes lie, ``(2, 1)``."""
+    median = float(row["figures"][key])
+    low, high = row["spread"].get(key, (median, median))
+    return median, [[median - low], [high - median]]

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether two versions of the package give the same trajectories, byte for byte.
+"""Check that two versions of the package give the same trajectories, byte for byte.
 
     python -m benchmarks.same_trajectories record main.json            # in a checkout of the old version
     python -m benchmarks.same_trajectories check main.json             # in a checkout of the new one
 
 Runs ``slamdepth run`` on freiburg1_rpy, freiburg1_desk, the 7-Scenes kitchen and a rendered room, each with
 predicted and, where there is one, sensor depth. Bytes are equal on one machine and one set of package
-versions only, so the file of digests is made anew on each machine and is not kept in the repository.
+versions only, so each machine records its own file of digests, and none is kept in the repository.
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import os
@@ -20,6 +19,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from benchmarks.command import parser_of
 from benchmarks.jobs import ROOT
 from slamdepth.io import write_json
 
@@ -37,7 +37,7 @@ ROOM_FRAMES = 300
 
 
 def slamdepth(*arguments: str) -> None:
-    """The command line of this checkout; its errors go where ours go.
+    """Run the command line of this checkout; it shares standard error.
 
     Raises:
         subprocess.CalledProcessError: it failed.
@@ -47,7 +47,7 @@ def slamdepth(*arguments: str) -> None:
 
 
 def digests(data: Path, work: Path, *, mesh: bool = False) -> dict[str, dict[str, str]]:
-    """sha256 of the files of each run, by ``sequence/depth``; sequences that are absent are left out."""
+    """Run everything; sha256 of the files of each run by ``sequence/depth``, without absent sequences."""
     room = work / "room"
     if not room.is_dir():
         slamdepth("synth", str(room), "--frames", str(ROOM_FRAMES), "--seed", "1")
@@ -80,9 +80,8 @@ def differences(old: dict[str, dict[str, str]], new: dict[str, dict[str, str]]) 
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """Run the command; returns its exit code, 1 where bytes differ."""
+    parser = parser_of("same_trajectories", __doc__)
     parser.add_argument("action", choices=("record", "check"))
     parser.add_argument("file", type=Path, help="JSON file of digests")
     parser.add_argument(
@@ -91,8 +90,10 @@ def main(arguments: list[str] | None = None) -> int:
         default=Path(os.environ.get("SLAMDEPTH_DATA", ROOT.parent / "shared" / "data")),
         help="folder of the real sequences; default: $SLAMDEPTH_DATA",
     )
-    parser.add_argument("--work", type=Path, help="keep the rendered room and the run folders here")
-    parser.add_argument("--mesh", action="store_true", help="compare the meshes, too")
+    parser.add_argument(
+        "--work", type=Path, help="folder of the rendered room and the runs (default: temporary)"
+    )
+    parser.add_argument("--mesh", action="store_true", help="compare meshes too")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="same-trajectories-") as temporary:
         work = options.work or Path(temporary)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SLAM systems side by side: same machine, same frames, same predicted depth.
+"""Compare SLAM systems on one machine, with the same frames and the same predicted depth.
 
     python -m benchmarks.slam --data DIR --runs 5 --output slam.json
+    python -m benchmarks.slam --data DIR --ablation --pace fast --output ablation.json
 
-See ``docs/benchmarks.md`` for how to read the table.
+Every run is a process of its own. See ``docs/benchmarks.md`` for the columns of the table.
 """
 
 from __future__ import annotations
@@ -12,22 +13,22 @@ import argparse
 import hashlib
 import logging
 import sys
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.command import errors_in_one_line
+from benchmarks.command import comma_separated, errors_in_one_line, parser_of, progress_line
 from benchmarks.depth_cache import default_cache
 from benchmarks.jobs import Job, run_job
 from benchmarks.orbslam3 import HOW_TO_INSTALL
+from benchmarks.record import environment, read_benchmark, write_benchmark
 from benchmarks.rows import ABLATIONS, NONE, SENSOR, SYSTEMS, Row, config_of, plan_ablation, plan_rows
-from benchmarks.summary import FORMAT, environment, read_benchmark, summarise
+from benchmarks.summary import summarise
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.errors import CameraError, ConfigError, DatasetError
 from slamdepth.frontend.features import create_extractor, needs_weights
-from slamdepth.io import write_json, write_text
+from slamdepth.io import write_text
 
 _BUSY = 0.5
 
@@ -82,7 +83,7 @@ def run_plan(plan: Plan) -> Iterator[dict[str, Any]]:
                 job = replace(job, vocabulary=str(vocabulary))
             if trouble is None and row.needs_predictions:
                 if row.depth not in folders:
-                    tell(f"{name}: predicting depth with {row.depth} for the peers")
+                    progress_line(f"{name}: predicting depth with {row.depth} for the peers")
                     folders[row.depth] = run_job(replace(job, kind="predict", cache=str(plan.cache)))
                 predicted = folders[row.depth]
                 trouble = None if predicted["status"] == "ok" else predicted
@@ -92,7 +93,7 @@ def run_plan(plan: Plan) -> Iterator[dict[str, Any]]:
                 continue
             results = []
             for number in range(plan.runs):
-                tell(f"{name}: {row.label} [{row.depth}], run {number + 1} of {plan.runs}")
+                progress_line(f"{name}: {row.label} [{row.depth}], run {number + 1} of {plan.runs}")
                 results.append(run_job(job, timeout_s=plan.timeout_s))
                 if results[-1]["status"] == "not installed":
                     break
@@ -113,7 +114,7 @@ def _prepare_orbslam3(plan: Plan, vocabulary: Path | None) -> tuple[dict[str, An
         digest = hashlib.sha256(names.encode()).hexdigest()[:12]
         vocabulary = plan.cache / f"orb-vocabulary-{digest}.txt"
         if not vocabulary.is_file():
-            tell(f"training an ORB vocabulary on {len(plan.training_images)} colour images")
+            progress_line(f"training an ORB vocabulary on {len(plan.training_images)} colour images")
             train_vocabulary_file(plan.training_images, vocabulary)
     return None, vocabulary
 
@@ -129,35 +130,31 @@ def training_images(data: Path, sequences: Iterable[Dataset]) -> list[Path]:
     return found
 
 
-def tell(text: str) -> None:
-    """Progress, apart from the tables."""
-    print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
-
-
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.slam", description=(__doc__ or "").splitlines()[0]
-    )
+    parser = parser_of("slam", __doc__)
     add = parser.add_argument
     add("--data", type=Path, required=True, help="folder that holds the sequences")
-    add("--sequences", type=_names, help="their names, with commas (default: all in --data)")
-    add("--systems", type=_names, default=list(SYSTEMS), help=f"with commas, of: {', '.join(SYSTEMS)}")
-    add("--depth", type=_names, default=[SENSOR, "dinov2"], help="'sensor' and names of depth models")
-    add("--features", type=_names, default=[], help="features slamdepth is run with, with commas: orb,sift")
+    add("--sequences", type=comma_separated, help="their names, with commas (default: all in --data)")
+    add("--systems", type=comma_separated, default=list(SYSTEMS), metavar="NAMES",
+        help=f"with commas, of: {', '.join(SYSTEMS)}")  # fmt: skip
+    add("--depth", type=comma_separated, default=[SENSOR, "dinov2"], metavar="NAMES",
+        help="'sensor' and names of depth models")  # fmt: skip
+    add("--features", type=comma_separated, default=[], metavar="NAMES",
+        help="features slamdepth is run with, with commas: orb,sift")  # fmt: skip
     add("--features-weights", type=Path, help="ONNX file of those that are a network: aliked")
     add("--features-matcher", type=Path, help="LightGlue's ONNX file for it")
     add("--runs", type=int, default=1, help="runs of each row; the table holds medians")
-    add("--ablation", action="store_true", help="instead: slamdepth with one part changed at a time")
+    add("--ablation", action="store_true", help="run slamdepth with one part changed at a time instead")
     add("--pace", choices=("sequence", "fast"), default="sequence",
         help="give each frame at its time, or as fast as it is taken")  # fmt: skip
     add("--max-frames", type=int)
     add("--stride", type=int, default=1)
-    add("--output", type=Path, help=".json to write; tables (.md) and plot (.svg) go beside it")
+    add("--output", type=Path, help=".json to write; tables (.md) and plot (.svg) get the same name")
     add("--compare", type=Path, help=".json of an earlier benchmark: print what changed")
     add("--vocabulary", type=Path, help="ORB-SLAM3's, DBoW2 text (default: trained here)")
     add("--cache", type=Path, help="folder for predictions and vocabulary")
-    add("--timeout", type=float, default=1800.0, help="seconds after which a run is given up")
+    add("--timeout", type=float, default=1800.0, help="seconds after which a run is stopped")
     return parser.parse_args(arguments)
 
 
@@ -218,35 +215,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     plan = make_plan(options)
     begun = environment()
     if begun["load_average"] is not None and begun["load_average"] > _BUSY:
-        tell(f"the machine is busy (load {begun['load_average']:.1f}): speeds will suffer")
+        progress_line(f"the machine is busy (load {begun['load_average']:.1f}): speeds will suffer")
     rows: list[dict[str, Any]] = []
-    benchmark = {
-        "format": FORMAT,
-        "environment": begun,
-        "settings": {
-            "runs": plan.runs,
-            "pace": plan.base.pace,
-            "stride": plan.base.stride,
-            "max_frames": plan.base.max_frames,
-            "vocabulary": "given" if plan.vocabulary else "trained",
-            "ablations": ABLATIONS if options.ablation else {},
-        },
-        "rows": rows,
+    settings = {
+        "runs": plan.runs,
+        "pace": plan.base.pace,
+        "stride": plan.base.stride,
+        "max_frames": plan.base.max_frames,
+        "vocabulary": "given" if plan.vocabulary else "trained",
+        "ablations": ABLATIONS if options.ablation else {},
     }
     code = 0
     try:
         for row in run_plan(plan):
             rows.append(row)
             if options.output:
-                write_json(options.output, benchmark)  # what is done is kept, whatever comes
+                write_benchmark(options.output, begun, settings, rows=rows)
     except KeyboardInterrupt:
-        tell("interrupted; the table holds what was done")
+        progress_line("interrupted; the table holds what was done")
         code = 130
-    _publish(benchmark, earlier, options.output)
+    _publish({"environment": begun, "settings": settings, "rows": rows}, earlier, options.output)
     return code
 
 
 def _publish(benchmark: dict[str, Any], earlier: dict[str, Any] | None, output: Path | None) -> None:
+    """Print the tables; next to the file go the tables as Markdown and the plot."""
     from rich.console import Console
 
     from benchmarks import tables
@@ -255,18 +248,13 @@ def _publish(benchmark: dict[str, Any], earlier: dict[str, Any] | None, output: 
     console = Console()
     if not console.is_terminal:
         console = Console(width=200)
-    if output:
-        write_json(output, benchmark)
+    if output and benchmark["rows"]:
         write_text(output.with_suffix(".md"), tables.markdown(benchmark))
         write_plot(output.with_suffix(".svg"), benchmark)
     for table in tables.rich_tables(benchmark):
         console.print(table)
     if earlier:
         console.print(tables.comparison_table(earlier, benchmark))
-
-
-def _names(text: str) -> list[str]:
-    return [name for name in (part.strip() for part in text.split(",")) if name]
 
 
 if __name__ == "__main__":

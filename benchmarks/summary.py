@@ -1,30 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several runs of a row become medians and spreads; a benchmark becomes one JSON file."""
+"""Medians and spread of several runs of a row."""
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.rows import Row
-from slamdepth.errors import InputError
-from slamdepth.report.environment import hardware, versions
-
-FORMAT = 1
 
 
 @dataclass(frozen=True)
 class Metric:
-    """A column: key in the figures, heading, decimals, factor for display, better direction.
+    """A column of the table.
 
-    ``better`` is -1 where less is better, 1 where more is, 0 where neither.
+    Attributes:
+        key: of the figure.
+        digits: decimals.
+        factor: from the figure to the shown value.
+        better: -1 where less is better, 1 where more is, 0 where neither.
     """
 
     key: str
@@ -53,20 +49,27 @@ METRICS = (
 """The columns of the table, in order."""
 
 
+def condense(runs: Sequence[Mapping[str, float]]) -> tuple[dict[str, float], dict[str, list[float]]]:
+    """The median of each figure over the runs that have it, and the least and the most where runs differ."""
+    medians: dict[str, float] = {}
+    spread: dict[str, list[float]] = {}
+    for key in dict.fromkeys(key for run in runs for key in run):
+        values = [run[key] for run in runs if key in run]
+        medians[key] = float(np.median(values))
+        if min(values) < max(values):
+            spread[key] = [float(min(values)), float(max(values))]
+    return medians, spread
+
+
 def summarise(sequence: str, row: Row, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """One entry of the JSON file: the runs as they were, and over the good ones each figure's
-    ``median``, ``min`` and ``max``. The status is "ok" where at least one run was."""
+    """One entry of the JSON file.
+
+    ``figures`` holds medians over the good runs, ``spread`` the least and the most where they differ. The
+    status is "ok" where at least one run was.
+    """
     good = [result for result in results if result["status"] == "ok"]
     bad = [result for result in results if result["status"] != "ok"]
-    keys = dict.fromkeys(key for result in good for key in result["figures"])
-    figures = {}
-    for key in keys:
-        values = [result["figures"][key] for result in good if key in result["figures"]]
-        figures[key] = {
-            "median": float(np.median(values)),
-            "min": float(np.min(values)),
-            "max": float(np.max(values)),
-        }
+    figures, spread = condense([result["figures"] for result in good])
     notes = list(dict.fromkeys([*([row.note] if row.note else []), *(n for r in good for n in r["notes"])]))
     messages = list(dict.fromkeys(str(result["message"]) for result in bad))
     if good and bad:
@@ -76,35 +79,9 @@ def summarise(sequence: str, row: Row, results: Sequence[Mapping[str, Any]]) -> 
         **row.published(),
         "status": "ok" if good else (str(bad[0]["status"]) if bad else "left out"),
         "message": "" if good else "; ".join(messages),
-        "runs": [dict(result) for result in results],
+        "runs": len(good),
+        "frames": good[0]["frames"] if good else 0,
         "figures": figures,
+        "spread": spread,
         "notes": notes,
     }
-
-
-def environment() -> dict[str, Any]:
-    """Versions, commit, hardware, and how busy the machine was when the benchmark began."""
-    found = versions()
-    try:
-        found["pyorbslam3"] = metadata.version("pyorbslam3")
-    except metadata.PackageNotFoundError:
-        found["pyorbslam3"] = None
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    return {"versions": found, "hardware": hardware(), "load_average": load}
-
-
-def read_benchmark(path: Path) -> dict[str, Any]:
-    """A file written by an earlier benchmark.
-
-    Raises:
-        InputError: it is missing or something else.
-    """
-    try:
-        loaded = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise InputError(f"{path}: not valid JSON: {error}") from error
-    if not isinstance(loaded, dict) or loaded.get("format") != FORMAT or "rows" not in loaded:
-        raise InputError(f"{path}: not a benchmark of this program (format {FORMAT})")
-    return loaded

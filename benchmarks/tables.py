@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables: for a terminal, for a document, and the change against an earlier benchmark."""
+"""Tables of the SLAM benchmark: for a terminal, for a document, and changes since an earlier benchmark."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.markdown import markdown_table
@@ -16,18 +16,19 @@ MISSING = "-"
 _NOISE = 0.02  # relative changes below this are not marked
 
 
-def cell(metric: Metric, figures: Mapping[str, Mapping[str, float]]) -> str:
-    """Median and, where runs differ, half of what lies between the extremes."""
-    value = figures.get(metric.key)
+def cell(metric: Metric, row: Mapping[str, Any]) -> str:
+    """The median and, where runs differ, half of the range between the extremes."""
+    value = row["figures"].get(metric.key)
     if value is None:
         return MISSING
-    text = f"{value['median'] * metric.factor:.{metric.digits}f}"
-    half = (value["max"] - value["min"]) / 2 * metric.factor
+    text = f"{value * metric.factor:.{metric.digits}f}"
+    low, high = row["spread"].get(metric.key, (value, value))
+    half = (high - low) / 2 * metric.factor
     return f"{text} ±{half:.{metric.digits}f}" if round(half, metric.digits) > 0 else text
 
 
 def by_sequence(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-    """The rows of each sequence, in order."""
+    """The rows of each sequence, in their order."""
     grouped: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
         grouped.setdefault(row["sequence"], []).append(row)
@@ -35,14 +36,13 @@ def by_sequence(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str
 
 
 def rich_tables(benchmark: Mapping[str, Any]) -> list[Table]:
-    """A table a sequence, notes beneath."""
+    """A table for each sequence, with the notes below it, for a terminal."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
     tables = []
     for sequence, rows in by_sequence(benchmark["rows"]).items():
-        shown = [metric for metric in METRICS if any(metric.key in row["figures"] for row in rows)]
         notes = [f"{_name(row)}: {note}" for row in rows for note in row["notes"]]
         table = Table(
             title=Text(sequence, style="bold"),
@@ -51,38 +51,40 @@ def rich_tables(benchmark: Mapping[str, Any]) -> list[Table]:
             caption=Text("\n".join(notes)),
             caption_justify="left",
         )
-        table.add_column("system", no_wrap=True)
-        table.add_column("depth")
-        for metric in shown:
-            table.add_column(metric.heading, justify="right")
-        for row in rows:
-            values = [cell(metric, row["figures"]) for metric in shown]
-            label = row["label"] if row["status"] == "ok" else f"{row['label']}: {_trouble(row)}"
-            table.add_row(Text(label), row["depth"], *values)
+        headings, lines = _headings_and_lines(rows)
+        for number, heading in enumerate(headings):
+            table.add_column(heading, no_wrap=number == 0, justify="left" if number < 2 else "right")
+        for line in lines:
+            table.add_row(*(Text(value) for value in line))
         tables.append(table)
     return tables
 
 
 def markdown(benchmark: Mapping[str, Any]) -> str:
-    """The same tables for ``docs/benchmarks.md``."""
-    parts = []
-    for sequence, rows in by_sequence(benchmark["rows"]).items():
-        shown = [metric for metric in METRICS if any(metric.key in row["figures"] for row in rows)]
-        lines = []
-        for row in rows:
-            label = row["label"] if row["status"] == "ok" else f"{row['label']}: {_trouble(row)}"
-            lines.append([label, row["depth"], *(cell(metric, row["figures"]) for metric in shown)])
-        headings = ["system", "depth", *(metric.heading for metric in shown)]
-        parts.append(f"### {sequence}\n\n{markdown_table(headings, lines)}")
+    """A table for each sequence, for ``docs/benchmarks.md``."""
+    parts = [
+        f"### {sequence}\n\n{markdown_table(*_headings_and_lines(rows))}"
+        for sequence, rows in by_sequence(benchmark["rows"]).items()
+    ]
     return "\n\n".join(parts) + "\n"
+
+
+def _headings_and_lines(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """The columns that any row has a figure for, and the cells of each row."""
+    shown = [metric for metric in METRICS if any(metric.key in row["figures"] for row in rows)]
+    lines = []
+    for row in rows:
+        label = row["label"] if row["status"] == "ok" else f"{row['label']}: {_trouble(row)}"
+        lines.append([label, row["depth"], *(cell(metric, row) for metric in shown)])
+    return ["system", "depth", *(metric.heading for metric in shown)], lines
 
 
 def changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, str, str, float, float, int]]:
     """What moved between two benchmarks.
 
     Returns:
-        Sequence, row, key, old and new median, and 1 for better, -1 for worse, 0 for neither
-        or within 2 %, for every row and figure that both have.
+        Sequence, row, key, old and new median of every row and figure that both have, and 1 for better,
+        -1 for worse, 0 for neither and for changes within 2 %.
     """
     before = {_key(row): row for row in old["rows"]}
     found = []
@@ -91,8 +93,7 @@ def changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, s
         for metric in METRICS:
             if earlier is None or metric.key not in earlier["figures"] or metric.key not in row["figures"]:
                 continue
-            was = float(earlier["figures"][metric.key]["median"])
-            now = float(row["figures"][metric.key]["median"])
+            was, now = float(earlier["figures"][metric.key]), float(row["figures"][metric.key])
             moved = abs(now - was) > _NOISE * max(abs(was), 1e-12)
             verdict = metric.better * (1 if now > was else -1) if moved else 0
             found.append((row["sequence"], _name(row), metric.key, was, now, verdict))
@@ -100,17 +101,19 @@ def changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, s
 
 
 def comparison_table(old: Mapping[str, Any], new: Mapping[str, Any]) -> Table:
-    """Old and new medians side by side; a warning where machine or settings differ."""
+    """Old and new medians, with a warning where machine or settings differ."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
     metrics = {metric.key: metric for metric in METRICS}
     commit = str(old["environment"]["versions"].get("commit"))[:10]
+    old_machine, new_machine = (one["environment"]["hardware"] for one in (old, new))
+    known = old_machine.keys() & new_machine.keys()
     differing = [
         name
         for name, differs in (
-            ("hardware", old["environment"]["hardware"] != new["environment"]["hardware"]),
+            ("hardware", any(old_machine[key] != new_machine[key] for key in known)),
             ("settings", old["settings"] != new["settings"]),
         )
         if differs

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run in a process of its own: ``python -m benchmarks.worker JOB.json RESULT.json``.
+"""One run in a process of its own, so that CPU time and peak memory are those of one system.
 
-Started by ``benchmarks.jobs``, so that CPU time and peak memory are those of one system.
+    python -m benchmarks.worker JOB.json RESULT.json
+
+``benchmarks.jobs`` starts it and writes the job.
 """
 
 from __future__ import annotations
@@ -27,14 +29,14 @@ from slamdepth.types import Frame, Trajectory
 
 @dataclass(frozen=True)
 class Measured:
-    """Time and memory of one run, reading and waiting left out.
+    """Time and memory of one run, without reading images and waiting.
 
     Attributes:
         step_s: wall time of each step.
         finish_s: wall time of ``finish``.
         cpu_s: processor time of all threads.
-        peak_memory_mib: most memory the process ever held.
-        without_depth: frames that had no depth image.
+        peak_memory_mib: peak memory of the process.
+        without_depth: number of frames without a depth image.
     """
 
     step_s: list[float]
@@ -45,7 +47,7 @@ class Measured:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the job and write what came of it."""
+    """Run the job and write its result."""
     job_file, result_file = map(Path, arguments)
     job = Job.from_dict(json.loads(job_file.read_text(encoding="utf-8")))
     try:
@@ -59,7 +61,7 @@ def main(arguments: list[str]) -> int:
 
 
 def predict(job: Job) -> dict[str, Any]:
-    """Fill the depth cache; the result names its folder."""
+    """Fill the depth cache; the result holds its folder."""
     from slamdepth.depth.registry import create_depth_model
 
     dataset = open_dataset(Path(job.sequence))
@@ -95,16 +97,15 @@ def run(job: Job) -> dict[str, Any]:
         "status": "ok",
         "frames": frames,
         "figures": figures,
-        "is_metric": estimate.trajectory.is_metric,
         "notes": notes,
     }
 
 
 def measure(system: System, dataset: Dataset, indices: range, job: Job) -> tuple[Measured, Estimate]:
-    """Feed the frames and finish, at the sequence's pace or as fast as they are taken.
+    """Play the frames and finish, at the pace of the sequence or as fast as the system takes them.
 
     Raises:
-        DatasetError: no image decodes.
+        DatasetError: no image can be decoded.
     """
     cache = DepthCache(Path(job.depth_folder)) if job.depth_folder else None
     step_s: list[float] = []
@@ -142,7 +143,10 @@ def measure(system: System, dataset: Dataset, indices: range, job: Job) -> tuple
 def score(truth: Trajectory | None, estimate: Estimate, notes: list[str]) -> dict[str, float]:
     """ATE and RPE of the full trajectory, and the ATE of the keyframes alone.
 
-    A trajectory without scale gets no SE(3) figures, and its RPE after the Sim(3) scale.
+    A trajectory without scale has no SE(3) figures; its RPE is that after Sim(3) scaling.
+
+    Args:
+        notes: gets a line where something cannot be scored.
     """
     from slamdepth.evaluation import score_trajectory
 
@@ -181,9 +185,10 @@ def _cpu_s() -> float:
 
 
 def memory_mib(name: str) -> float:
-    """Of this process alone, the most ever ("VmHWM") or now ("VmRSS").
+    """Memory of this process: the peak ("VmHWM") or the current resident memory ("VmRSS").
 
-    On Linux ``ru_maxrss`` would start at that of the parent; elsewhere it is the most, for both.
+    ``ru_maxrss`` starts at the value of the parent process on Linux, so it is used on other systems only,
+    where both names give the peak.
     """
     try:
         lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()

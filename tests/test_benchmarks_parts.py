@@ -55,9 +55,8 @@ def helix(count: int = 60) -> Trajectory:
 
 
 def entry(label: str, **medians: float) -> dict[str, Any]:
-    figures = {key: {"median": v, "min": v, "max": v} for key, v in medians.items()}
     row = {"sequence": "room", "label": label, "depth": "sensor", "status": "ok", "message": "", "notes": []}
-    return {**row, "figures": figures}
+    return {**row, "figures": medians, "spread": {}}
 
 
 def test_each_row_is_unique_and_its_settings_are_valid() -> None:
@@ -212,20 +211,19 @@ def test_a_trajectory_without_scale_is_scored_after_scaling() -> None:
 
 def test_median_and_extremes_over_the_good_runs() -> None:
     def good(ate: float) -> dict[str, Any]:
-        return {"status": "ok", "figures": {"ate_se3_m": ate}, "notes": []}
+        return {"status": "ok", "frames": 9, "figures": {"ate_se3_m": ate}, "notes": []}
 
     bad = {"status": "failed", "message": "crashed with SIGSEGV"}
     row = summarise("room", Row("x", "open3d", "sensor"), [good(3.0), bad, good(1.0), good(1.5)])
     assert row["status"] == "ok"
-    assert row["figures"]["ate_se3_m"] == {"median": 1.5, "min": 1.0, "max": 3.0}
+    assert (row["runs"], row["figures"], row["spread"]) == (3, {"ate_se3_m": 1.5}, {"ate_se3_m": [1.0, 3.0]})
     assert row["notes"] == ["1 of 4 runs failed: crashed with SIGSEGV"]
     failed = summarise("room", Row("x", "open3d", "sensor"), [bad])
     assert (failed["status"], failed["message"], failed["figures"]) == ("failed", "crashed with SIGSEGV", {})
 
 
 def test_a_table_shows_median_and_spread_and_trouble() -> None:
-    row = entry("ours", tracked=1.0)
-    row["figures"]["fps"] = {"median": 30.0, "min": 29.0, "max": 33.0}
+    row = {**entry("ours", tracked=1.0, fps=30.0), "spread": {"fps": [29.0, 33.0]}}
     lost = {**entry("theirs"), "status": "not installed", "message": "not installed: pip install '.[bench]'"}
     text = tables.markdown({"rows": [row, lost]})
     assert "| ours | sensor | 100.0 | 30.0 ±2.0 |" in text

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks import places
-from benchmarks.places_methods import mutual_share, vectors
+from benchmarks.places_methods import vectors
 from benchmarks.places_scores import score_answers
 from benchmarks.places_truth import labels, overlaps
 from slamdepth.errors import WeightsError
@@ -79,13 +79,6 @@ def test_equal_scores_are_accepted_together_and_silence_is_not_wrong() -> None:
 
 def test_only_frames_old_enough_are_asked_for() -> None:
     assert places.earlier_frames([0.0, 1.0, 2.5, 3.0], 2.0) == {2: [0], 3: [0, 1]}
-
-
-def test_patches_count_where_each_is_the_others_nearest() -> None:
-    a = np.eye(4, dtype=np.float32)
-    assert mutual_share(a, a[::-1].copy()) == 1.0
-    assert mutual_share(a, a[[0, 0, 0, 0]]) == 0.25
-    assert mutual_share(a, -a) == 0.0  # mutual, yet nothing alike
 
 
 def test_vectors_answer_by_their_cosine() -> None:
