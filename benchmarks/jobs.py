@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs as processes: a job is a file of JSON, and so is its result; a crash is a result too."""
+"""Runs as processes of their own: job and result are JSON files, and a crash is a result too."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker needs to know.
+    """One task of a worker process.
 
     Attributes:
-        kind: measure a run, or predict depth for later ones.
-        pace: ``"sequence"`` gives each frame not before its time, ``"fast"`` at once.
-        cache: where predictions go; of kind ``"predict"`` only.
-        depth_folder: predictions that replace the frames' depth.
-        vocabulary: ORB-SLAM3's.
+        kind: measure a run, or predict depth for later runs.
+        pace: ``"sequence"`` gives no frame before its timestamp, ``"fast"`` gives each at once.
+        cache: folder of the predictions of kind ``"predict"``.
+        depth_folder: folder of predictions that replace the depth of the frames.
+        vocabulary: file of ORB-SLAM3's vocabulary.
     """
 
     sequence: str
@@ -42,19 +42,23 @@ class Job:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Job:
+        """The job that ``dataclasses.asdict`` turned into ``values``."""
         return cls(**{**values, "row": Row(**values["row"])})
 
     def indices(self, frames: int) -> range:
-        """Which of a sequence's frames are taken."""
+        """The frames to play of a sequence of ``frames`` frames."""
         return RunOptions(Path(self.sequence), max_frames=self.max_frames, stride=self.stride).indices(frames)
 
 
 def run_job(job: Job, *, timeout_s: float | None = None) -> dict[str, Any]:
     """Run a job in a fresh process and wait for it.
 
+    Args:
+        timeout_s: seconds after which the process is stopped.
+
     Returns:
-        Its result: ``status`` is "ok", "failed" or "not installed", the latter two with a
-        one-line ``message``.
+        The result; ``status`` is "ok", "failed" or "not installed", the latter two with a ``message`` of
+        one line.
     """
     with tempfile.TemporaryDirectory(prefix="slam-benchmark-") as name:
         folder = Path(name)
@@ -68,7 +72,7 @@ def run_job(job: Job, *, timeout_s: float | None = None) -> dict[str, Any]:
                 ).returncode
             except subprocess.TimeoutExpired:
                 return {"status": "failed", "message": f"stopped after {timeout_s:g} s"}
-        if result_file.is_file():  # a peer may still crash while it is taken down
+        if result_file.is_file():  # even if a peer crashed afterwards, in its destructor
             try:
                 return dict(json.loads(result_file.read_text(encoding="utf-8")))
             except ValueError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of documents."""
+"""Markdown tables."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 
 def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Headings and rows of as many cells, of any text on one line; what a row lacks stays empty."""
+    """A Markdown table; cells are text of one line, and missing cells of a row stay empty."""
     lines = [_line(headings), "| --- " * len(headings) + "|"]
     for row in rows:
         cells = [cell.replace("|", "\\|") for cell in row]

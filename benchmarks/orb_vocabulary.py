@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A vocabulary tree for ORB-SLAM3, trained here, so that its 140 MB file is not needed.
+"""Train a vocabulary tree for ORB-SLAM3, whose own file has 140 MB.
 
-The file is DBoW2's text format: ``branches depth 0 0``, then a line per node: parent,
-1 for a leaf, 32 descriptor bytes, weight.
+The file has DBoW2's text format: ``branches depth 0 0``, then one line per node with its parent, 1 for a
+leaf, 32 descriptor bytes and the weight.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 BRANCHES = 10
-DEPTH = 6  # as in ORB-SLAM's own file: matching by word looks four levels above the deepest leaf
+DEPTH = 6  # of ORB-SLAM's own file; matching by word looks four levels above the deepest leaf
 MIN_SPLIT = 60  # nodes with fewer descriptors stay leaves
 SAMPLE = 300_000
 FEATURES = 1000
@@ -35,7 +35,13 @@ FEATURES = 1000
 
 @dataclass(frozen=True)
 class Node:
-    """A node of the tree: its parent's number (0 is the root), its word, whether it is a leaf."""
+    """A node of the tree.
+
+    Attributes:
+        parent: number of the parent; 0 is the root.
+        word: descriptor, 32 bytes.
+        weight: inverse document frequency of a leaf, 0 for others.
+    """
 
     parent: int
     word: Descriptors
@@ -49,8 +55,7 @@ def train_tree(
     """Hierarchical k-majority clustering of the descriptors ``(N_i, 32)`` of each image.
 
     Returns:
-        The nodes below the root in the order of their numbers, from 1; parents come first.
-        The weight of a leaf is its inverse document frequency.
+        The nodes below the root in the order of their numbers, from 1; parents come before children.
     """
     rng = np.random.default_rng(seed)
     descriptors = np.concatenate(list(images))
@@ -79,7 +84,7 @@ def train_tree(
 
 
 def write_tree(path: Path, nodes: Sequence[Node], *, branches: int = BRANCHES, depth: int = DEPTH) -> None:
-    """Write the tree as DBoW2 reads it; no newline at the end, which it takes for a node."""
+    """Write the tree for DBoW2, without a newline at the end, which DBoW2 would read as a node."""
     lines = [f"{branches} {depth} 0 0"]
     for node in nodes:
         word = " ".join(map(str, node.word))
@@ -91,7 +96,7 @@ def train_vocabulary_file(images: Sequence[Path], output: Path) -> None:
     """Train on colour images and write ``output``.
 
     Raises:
-        DatasetError: none of the images has features.
+        DatasetError: the images have fewer than 1,000 features.
     """
     import cv2
 
@@ -103,7 +108,7 @@ def train_vocabulary_file(images: Sequence[Path], output: Path) -> None:
         try:
             gray = cv2.cvtColor(read_image_rgb(path), cv2.COLOR_RGB2GRAY)
         except ImageDecodeError as error:
-            logger.warning("left out of the vocabulary: %s", error)
+            logger.warning("skipped for the vocabulary: %s", error)
             continue
         _, descriptors = orb.detectAndCompute(gray, None)
         if descriptors is not None:

@@ -27,10 +27,10 @@ HOW_TO_INSTALL = "not installed: pip install '.[bench]'"
 
 
 def import_pyorbslam3() -> Any:
-    """The binding.
+    """Import the Python binding.
 
     Raises:
-        NotInstalled: the package is missing, or a library of the system it needs.
+        NotInstalled: the package, or a system library that it needs, is missing.
     """
     try:
         return importlib.import_module("pyorbslam3")
@@ -47,11 +47,11 @@ class OrbSlam3:
     """ORB-SLAM3 with the settings of its own TUM examples and the sequence's camera.
 
     Args:
-        mode: ``"rgbd"`` takes ``frame.depth_m`` as a sensor's; frames without are left out.
+        mode: ``"rgbd"`` takes ``frame.depth_m`` as sensor depth and skips frames without.
         vocabulary: DBoW2 text file.
 
     Raises:
-        NotInstalled: there is no ``pyorbslam3``.
+        NotInstalled: ``pyorbslam3`` is missing.
     """
 
     def __init__(self, camera: Camera, mode: Mode, vocabulary: Path) -> None:
@@ -74,7 +74,7 @@ class OrbSlam3:
         self._times.append(frame.timestamp_s)
 
     def finish(self) -> Estimate:
-        """Stop its threads and read the biggest map's poses.
+        """Stop the threads and read the poses of the biggest map.
 
         Raises:
             TrackingError: it never initialised.
@@ -88,12 +88,12 @@ class OrbSlam3:
         trajectory = _read(all_file, np.array(self._times), is_metric)
         keyframes = _read(keyframe_file, np.array(self._times), is_metric)
         if trajectory is None:
-            raise TrackingError("it placed no frame")
+            raise TrackingError("it tracked no frame")
         return Estimate(trajectory, keyframes, {"keyframes": len(keyframes) if keyframes else 0})
 
 
 def settings_text(camera: Camera) -> str:
-    """The settings file; ORB and depth threshold as in ORB-SLAM3's ``TUM1.yaml``."""
+    """Text of the settings file; ORB and depth threshold are those of ORB-SLAM3's ``TUM1.yaml``."""
     k1, k2, p1, p2, k3 = camera.distortion
     return f"""%YAML:1.0
 File.version: "1.0"
@@ -133,7 +133,7 @@ Viewer.ViewpointF: 500.0
 
 
 def _read(path: Path, times_s: NDArray[np.float64], is_metric: bool) -> Trajectory | None:
-    """A EuRoC-style file: nanoseconds and ``x y z qx qy qz qw``; times snapped to the frames'."""
+    """Read a EuRoC file of nanoseconds and ``x y z qx qy qz qw``; times are snapped to ``times_s (N,)``."""
     if not path.is_file():
         return None
     rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]

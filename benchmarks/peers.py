@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry peers that need depth: Open3D's RGB-D odometry and KISS-ICP as it comes."""
+"""Odometry peers that need depth: Open3D's RGB-D odometry and KISS-ICP."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MIN_FITNESS = 0.05  # share of pixels that must agree for a step to count
 
 
 class _Odometry:
-    """Poses collected frame by frame; the world is the first placed camera."""
+    """Collects poses frame by frame; the world is the first tracked camera."""
 
     def __init__(self) -> None:
         self._times: list[float] = []
@@ -32,23 +32,22 @@ class _Odometry:
         self._poses.append(orthonormalised(T_world_camera))
 
     def finish(self) -> Estimate:
-        """The poses as they were; odometry optimises nothing afterwards.
+        """The collected poses; odometry has no final optimisation.
 
         Raises:
-            TrackingError: no frame was placed.
+            TrackingError: no frame was tracked.
         """
         if not self._poses:
-            raise TrackingError("it placed no frame")
+            raise TrackingError("it tracked no frame")
         return Estimate(Trajectory(np.array(self._times), np.stack(self._poses)))
 
 
 class Open3dOdometry(_Odometry):
-    """Frame to frame, multi-scale, colour and depth together (Park et al., ICCV 2017).
+    """Frame-to-frame RGB-D odometry, multi-scale and hybrid (Park et al., ICCV 2017).
 
-    Open3D knows no lens distortion, so both images are undistorted first, within the
-    measured time. A constant velocity is its first guess and it gets twice its default
-    iterations: without, it loses fast rotation. A step that fails leaves its frame without
-    a pose, and the next one is registered to the last placed frame.
+    Open3D has no lens distortion, so both images are undistorted within the measured time. The initial guess
+    is a constant velocity, and the iterations are twice the default: otherwise it loses fast rotation. A
+    frame that fails gets no pose, and the next frame is registered to the last tracked one.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -94,7 +93,7 @@ class Open3dOdometry(_Odometry):
                 depth_max=MAX_DEPTH_M,
                 criteria_list=self._criteria,
             )
-        except RuntimeError:  # Open3D's word for a system of equations without a solution
+        except RuntimeError:  # the system of equations has no solution
             return None
         T_last_now = np.asarray(result.transformation.numpy(), dtype=np.float64)
         if result.fitness < _MIN_FITNESS or not np.isfinite(T_last_now).all():
@@ -116,10 +115,9 @@ class Open3dOdometry(_Odometry):
 
 
 class KissIcp(_Odometry):
-    """KISS-ICP (Vizzo et al., RA-L 2023) as its authors wrote it; only the ranges are a room's.
+    """KISS-ICP (Vizzo et al., RA-L 2023) as published, with ranges for indoor scenes.
 
-    One difference to its own pipeline: every fourth pixel of a depth image is taken, and
-    none on depth edges.
+    Its clouds have every fourth pixel of a depth image, without depth edges.
     """
 
     def __init__(self, camera: Camera) -> None:

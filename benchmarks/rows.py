@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rows of the table: which system, fed with what, under which settings."""
+"""The rows of the table: systems, their depth and their settings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SENSOR = "sensor"
 NONE = "none"
 OURS = "slamdepth"
 FILES = {"weights", "matcher"}
-"""Settings of a feature that name a file."""
+"""Settings of a feature that hold a file."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class Row:
     """One line of the table.
 
     Attributes:
-        label: what the table calls it; unique together with ``depth``.
+        label: name in the table; unique together with ``depth``.
         system: key of :data:`SYSTEMS`.
-        depth: ``"sensor"``, ``"none"`` or a depth model's registered name.
-        settings: nested settings of slamdepth, over its defaults.
-        note: what a reader should know, or nothing.
+        depth: ``"sensor"``, ``"none"`` or the registered name of a depth model.
+        settings: nested settings of slamdepth that differ from its defaults.
+        note: a note below the table, or nothing.
     """
 
     label: str
@@ -43,7 +43,7 @@ class Row:
         return self.system.startswith("slamdepth")
 
     def published(self) -> dict[str, Any]:
-        """What the table's file says of the row: of weights files only the names."""
+        """The row as the JSON file holds it, with names of weights files instead of their paths."""
         row = asdict(self)
         del row["note"]
         for key in FILES & row["settings"].get("features", {}).keys():
@@ -56,7 +56,7 @@ class Row:
 
     @property
     def needs_predictions(self) -> bool:
-        """Peers get predictions from the cache; slamdepth's network runs live."""
+        """Whether it gets predictions from the cache; slamdepth's own network runs in the measured time."""
         return not self.is_ours and self.depth not in (SENSOR, NONE)
 
 
@@ -91,7 +91,7 @@ SYSTEMS: dict[str, Callable[[Sequence[str]], list[Row]]] = {
     "open3d": _open3d,
     "kiss-icp": _kiss_icp,
 }
-"""Rows of each system for the depths asked for."""
+"""For each system the function that makes its rows for a list of depths."""
 
 ABLATIONS: dict[str, dict[str, Any]] = {
     "as shipped": {},
@@ -117,7 +117,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "keyframe overlap 0.8": {"tracking": {"keyframe_overlap": 0.8}},
     "keyframe overlap 0.9": {"tracking": {"keyframe_overlap": 0.9}},
 }
-"""Our own parts, one changed at a time: settings over the defaults."""
+"""Rows of the ablation: settings that differ from the defaults."""
 
 
 def plan_rows(
@@ -143,14 +143,14 @@ def plan_rows(
 
 
 def with_feature(row: Row, settings: dict[str, Any]) -> Row:
-    """slamdepth's row with other features; the default ones go without saying."""
+    """The row with other features, which its label names unless they are the default."""
     if settings == {"name": Config().features.name}:
         return row
     return replace(row, label=f"{row.label}, {settings['name']}", settings={"features": settings})
 
 
 def plan_ablation(depths: Sequence[str]) -> list[Row]:
-    """slamdepth with one part changed at a time; what is the default anyway is left out."""
+    """slamdepth with one part changed at a time; variants equal to the default are left out."""
     rows = []
     for depth in depths:
         shipped, *others = (Row(label, OURS, depth, s) for label, s in ABLATIONS.items())
@@ -162,7 +162,7 @@ def config_of(row: Row) -> Config:
     """slamdepth's settings for a row.
 
     Raises:
-        ConfigError: a setting of the row does not exist (any more) or is out of range.
+        ConfigError: a setting of the row is unknown or out of range.
     """
     return Config.from_dict(merge({"depth": {"name": row.depth}}, row.settings), origin=f"row '{row.label}'")
 

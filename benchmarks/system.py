@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a system under test is, to the harness."""
+"""The interface of a system under test."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class NotInstalled(Exception):
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a system knows in the end.
+    """The result of a system.
 
     Attributes:
-        trajectory: every frame it placed, after its own optimisation.
-        keyframes: its keyframes alone, where it says which they are.
-        counts: what else it counts, by name.
-        notes: what a reader of the table should know, one line each.
+        trajectory: poses of all tracked frames, after the system's own optimisation.
+        keyframes: poses of the keyframes; None where the system does not name them.
+        counts: other counts by name, such as loops.
+        notes: notes below the table, one line each.
     """
 
     trajectory: Trajectory
@@ -31,12 +31,12 @@ class Estimate:
 
 
 class System(Protocol):
-    """One SLAM or odometry program; built outside the measured time."""
+    """One SLAM or odometry program; it is built outside the measured time."""
 
     def step(self, frame: Frame) -> None:
-        """Take in the next frame, with ``depth_m`` where the row says so."""
+        """Track the next frame; it has ``depth_m`` where the row asks for depth."""
         ...
 
     def finish(self) -> Estimate:
-        """Optimise what is left to optimise and hand over the poses."""
+        """Do the final optimisation and hand over the poses."""
         ...
