@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # make demo   everything from nothing: environment, weights, a sequence, the main job
 # make test   the tests
+# make docs   the API reference, from the docstrings, in docs/api/
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -9,7 +10,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := pyproject.toml constraints.txt README.md LICENSE \
 	$(shell find slamdepth -type f -not -name '*.pyc' -not -name '.*')
 
-.PHONY: demo test lint types layers check install install-dev format clean
+.PHONY: demo test lint types layers check docs install install-dev install-docs format clean
 
 demo: install
 	$(BIN)/slamdepth weights pull
@@ -31,12 +32,16 @@ layers: install-dev
 
 check: lint types layers test
 
+docs: install-docs
+	$(BIN)/python docs/make_api.py
+
 format: install-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 install: $(VENV)/.package
 install-dev: $(VENV)/.dev
+install-docs: $(VENV)/.docs
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -49,5 +54,9 @@ $(VENV)/.dev: $(VENV)/.package
 	$(PIP) '.[dev]'
 	touch $@
 
+$(VENV)/.docs: $(VENV)/.package
+	$(PIP) '.[docs]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) demo docs/api build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
