@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The README says what is true: its example runs, its commands and files exist."""
+"""The README's example runs, and the commands, files and links of all documents exist."""
 
 from __future__ import annotations
 
@@ -10,10 +10,24 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+RECORD = ROOT / "docs" / "experiments"
+"""Dated files, which name modules of their day."""
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *RECORD.glob("*.md")])
+CURRENT = [document for document in DOCUMENTS if document.parent != RECORD]
+
+
+def name_of(document: Path) -> str:
+    return document.relative_to(ROOT).as_posix()
 
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+def anchors(document: Path) -> set[str]:
+    """Anchors of a document's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", document.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def test_the_python_example_runs(
@@ -26,15 +40,15 @@ def test_the_python_example_runs(
     exec(compile(example, "README.md", "exec"), {"__name__": "example"})
     shown = capsys.readouterr().out
     assert shown.splitlines()[-1].startswith("40 poses, ")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["demo"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["demo", "room.ply"]
 
 
 def test_the_camera_file_can_be_read(tmp_path: Path) -> None:
-    from slamdepth.datasets import read_camera
+    import slamdepth
 
     (text,) = blocks("yaml")
     (tmp_path / "camera.yaml").write_text(text)
-    assert read_camera(tmp_path / "camera.yaml").width == 640
+    assert slamdepth.Camera.from_file(tmp_path / "camera.yaml").width == 640
 
 
 def test_the_commands_exist() -> None:
@@ -51,19 +65,33 @@ def test_the_commands_exist() -> None:
 def test_the_run_folder_is_explained() -> None:
     from slamdepth.pipeline.folder import FILES
 
-    section = README.split("### What a run leaves behind")[1].split("###")[0]
+    section = README.split("### Output files")[1].split("###")[0]
     assert set(re.findall(r"`(\w+\.(?:txt|ply|png|html|json|yaml))`", section)) == set(FILES)
 
 
-def test_linked_files_exist() -> None:
-    for document in ("README.md", "CONTRIBUTING.md", "docs/architecture.md"):
-        folder = (ROOT / document).parent
-        for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", (ROOT / document).read_text(encoding="utf-8")):
-            assert (folder / link).exists(), f"{document}: {link}"
+@pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
+def test_linked_files_and_headings_exist(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    for link, anchor in re.findall(r"\]\((?!https?:)([^)#]*)#?([^)]*)\)", text):
+        target = (document.parent / link) if link else document
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), f"{link}#{anchor}"
 
 
-def test_named_modules_exist() -> None:
-    for document in ("README.md", "CONTRIBUTING.md", "docs/architecture.md"):
-        text = (ROOT / document).read_text(encoding="utf-8")
-        for path in re.findall(r"`((?:slamdepth|tests|data_scripts|benchmarks)/[\w/.-]*)`", text):
-            assert (ROOT / path).exists(), f"{document}: {path}"
+@pytest.mark.parametrize("document", CURRENT, ids=name_of)
+def test_named_files_exist(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    for path in re.findall(r"`((?:slamdepth|tests|data_scripts|benchmarks)/[\w/.-]*)`", text):
+        assert (ROOT / path).exists(), path
+
+
+@pytest.mark.parametrize("document", CURRENT, ids=name_of)
+def test_named_benchmarks_exist(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    for module in re.findall(r"python -m benchmarks\.(\w+)", text):
+        assert (ROOT / "benchmarks" / f"{module}.py").exists(), module
+
+
+def test_every_experiment_is_in_the_index() -> None:
+    linked = set(re.findall(r"\]\((\d{4}-\d\d-\d\d-[\w-]+\.md)\)", (RECORD / "README.md").read_text("utf-8")))
+    assert linked == {path.name for path in RECORD.glob("[0-9]*.md")}
