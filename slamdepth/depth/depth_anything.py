@@ -17,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional as F
 
-from slamdepth.depth import weights as store
 from slamdepth.depth.card import ModelCard
 from slamdepth.depth.checkpoints import check_device, find_checkpoint, load_strictly, read_checkpoint
 from slamdepth.depth.dinov2 import IMAGENET_MEAN, IMAGENET_STD
@@ -26,6 +25,7 @@ from slamdepth.depth.network import NetworkDepth
 from slamdepth.depth.preprocess import PATCH
 from slamdepth.depth.registry import register
 from slamdepth.errors import WeightsError
+from slamdepth.io import sha256_of
 from slamdepth.types import DepthKind, WeightsInfo
 
 SHORT_SIDE = 518
@@ -107,7 +107,7 @@ class DepthAnythingV2(NetworkDepth):
             unused={"pretrained.mask_token": (1, shape.dim)},
             device=device,
         )
-        info = WeightsInfo(path.stem, store.sha256_of(path), card.trained_on, card.licence)
+        info = WeightsInfo(path.stem, sha256_of(path), card.trained_on, card.licence)
         return cls(network, card, (info,), device)
 
     def infer(self, image_rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], tuple[int, int]]:

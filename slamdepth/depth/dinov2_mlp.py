@@ -27,6 +27,7 @@ from slamdepth.depth.network import NetworkDepth
 from slamdepth.depth.preprocess import normalised, resize_rgb
 from slamdepth.depth.registry import register
 from slamdepth.errors import WeightsError
+from slamdepth.io import sha256_of
 from slamdepth.types import DepthKind, WeightsInfo
 
 NAME = "dinov2-mlp"
@@ -145,7 +146,7 @@ class Dinov2Mlp(NetworkDepth):
         card = model_card(about)
         infos = (
             store.backbone_info(backbone_file),
-            WeightsInfo(path.stem, store.sha256_of(path), card.trained_on, card.licence),
+            WeightsInfo(path.stem, sha256_of(path), card.trained_on, card.licence),
         )
         return cls(load_dinov2(backbone_file, device), head, card, infos, device)
 

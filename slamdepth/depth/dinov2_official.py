@@ -23,6 +23,7 @@ from slamdepth.depth.network import NetworkDepth
 from slamdepth.depth.preprocess import PATCH, normalised, resize_rgb
 from slamdepth.depth.registry import register
 from slamdepth.errors import WeightsError
+from slamdepth.io import sha256_of
 from slamdepth.types import DepthKind, WeightsInfo
 
 LICENCE = "Apache-2.0 (DINOv2)"
@@ -108,7 +109,7 @@ class Dinov2OfficialDepth(NetworkDepth):
         backbone_file = store.find_backbone(backbone)
         infos = (
             store.backbone_info(backbone_file),
-            WeightsInfo(path.stem, store.sha256_of(path), card.trained_on, card.licence),
+            WeightsInfo(path.stem, sha256_of(path), card.trained_on, card.licence),
         )
         return cls(load_dinov2(backbone_file, device), network, card, infos, device)
 

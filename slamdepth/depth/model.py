@@ -30,6 +30,7 @@ from slamdepth.depth.preprocess import (
 from slamdepth.depth.registry import register
 from slamdepth.depth.upright import roll_rad, turned, turned_back
 from slamdepth.depth.vanishing import find_lines, manhattan_frames
+from slamdepth.io import sha256_of
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 
 _TURN_RAD = math.radians(8.0)
@@ -116,7 +117,7 @@ class Dinov2Depth:
             backbone_info,
             WeightsInfo(
                 head_file.stem,
-                store.sha256_of(head_file),
+                sha256_of(head_file),
                 about.get("trained_on", "unknown"),
                 about.get("licence", "unknown"),
             ),

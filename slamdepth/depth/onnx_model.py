@@ -27,11 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from slamdepth.depth import weights as store
 from slamdepth.depth.card import ModelCard
 from slamdepth.depth.network import NetworkDepth
 from slamdepth.depth.preprocess import resize_rgb
 from slamdepth.errors import ConfigError, WeightsError
+from slamdepth.io import sha256_of
 from slamdepth.types import DepthKind, WeightsInfo
 
 METADATA_KEY = "slamdepth"
@@ -100,7 +100,7 @@ class OnnxDepth(NetworkDepth):
         about = _about(path, session.get_modelmeta().custom_metadata_map)
         size, is_fixed = _input_size(path, session, about)
         card = ModelCard(f"onnx:{path}", about.kind, size, about.focal_px, about.licence, about.trained_on)
-        info = WeightsInfo(path.stem, store.sha256_of(path), about.trained_on, about.licence)
+        info = WeightsInfo(path.stem, sha256_of(path), about.trained_on, about.licence)
         return cls(session, about, card, (info,), device, is_fixed=is_fixed)
 
     def infer(self, image_rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], tuple[int, int]]:

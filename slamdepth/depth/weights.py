@@ -8,7 +8,6 @@ as safetensors in a cache. The depth head ships inside this package.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import os
@@ -22,6 +21,7 @@ from pathlib import Path
 
 from slamdepth.depth.layout import pack_about, unpack_about
 from slamdepth.errors import WeightsError
+from slamdepth.io import sha256_of
 from slamdepth.types import WeightsInfo
 
 logger = logging.getLogger(__name__)
@@ -73,15 +73,6 @@ def cache_dir() -> Path:
 def head_path() -> Path:
     """The depth head that ships with the package."""
     return Path(__file__).resolve().parent.parent / "assets" / f"{HEAD}.safetensors"
-
-
-def sha256_of(path: Path) -> str:
-    """Hex sha256 of a file."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-    return digest.hexdigest()
 
 
 def backbone_info(path: Path) -> WeightsInfo:

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from slamdepth.config import FeatureConfig
-from slamdepth.depth.weights import sha256_of
 from slamdepth.errors import ConfigError, TrackingError, WeightsError
 from slamdepth.frontend.matching import PixelGrid, match_all
 from slamdepth.frontend.metric import ORB, DescriptorMetric
+from slamdepth.io import sha256_of
 from slamdepth.types import Camera, WeightsInfo
 from slamdepth.typing import Floats, Ints
 
