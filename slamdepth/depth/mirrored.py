@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slamdepth.depth.base import DepthModel
+from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.card import card_of
 from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind, DepthPrediction, Frame
@@ -30,7 +30,7 @@ class MirroredDepth:
     """
 
     def __init__(self, model: DepthModel) -> None:
-        if model.name == "sensor":
+        if is_sensor(model):
             raise ConfigError("depth model 'mirrored:sensor': a sensor's depth needs no mirror; use 'sensor'")
         self.name, self.kind, self.weights = f"mirrored:{model.name}", model.kind, model.weights
         card = card_of(model)

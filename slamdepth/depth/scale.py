@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.depth.base import DepthModel
+from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.robust_line import robust_line
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.evaluation.bootstrap import block_resamples
@@ -143,7 +143,7 @@ def fit_scale(
 
 def check_can_fit(model: DepthModel, with_shift: bool) -> None:
     """Raise ConfigError where a fit of this model would mean nothing; see :func:`fit_scale`."""
-    if model.name == "sensor":
+    if is_sensor(model):
         raise ConfigError("the sensor's depth is in metres already: only predicted depth has a scale to fit")
     if needs_shift(model.kind) and not with_shift:
         raise ConfigError(

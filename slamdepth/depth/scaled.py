@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamdepth.depth.base import DepthModel
+from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.scale import DepthScale, ScaleDomain, needs_shift
 from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind, DepthPrediction, Frame
@@ -27,7 +27,7 @@ class ScaledDepth:
     kind = DepthKind.METRIC
 
     def __init__(self, model: DepthModel, scale: DepthScale) -> None:
-        if model.name == "sensor":
+        if is_sensor(model):
             raise ConfigError("the sensor's depth is in metres already: a depth scale is for predicted depth")
         if scale.domain is not ScaleDomain.of(model.kind):
             raise ConfigError(
