@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Heads that are told where down is, views turned upright, and sources that teach a part of depth."""
+"""Heads that read gravity, views rotated upright, and sources that supervise shape, scale or gravity only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from training_places import make_place
 
 from slamdepth.depth.gravity_field import gravity_field
-from slamdepth.depth.head import DepthHead, HeadEnsemble, HeadShape, load_head, save_head
+from slamdepth.depth.head import FORMAT, DepthHead, HeadEnsemble, HeadShape, load_head, save_head
 from slamdepth.depth.layout import pack_about
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
 from slamdepth.depth.upright import roll_rad
@@ -33,7 +33,7 @@ from slamdepth.training.stages import not_always_told
 from slamdepth.training.views import Partner, SampleKey, make_view
 from slamdepth.types import Camera, Frame
 
-SHAPE = HeadShape(taps=(0, 2), token_dim=24, dim=16, blocks=1, guide_dim=8, level_dim=4, gravity=True)
+SHAPE = HeadShape(taps=(0, 2), token_dim=24, dim=16, blocks=1, guide_dim=8, scale_dim=4, gravity=True)
 _SEEDED = torch.Generator().manual_seed(1)
 ARGS = tuple(
     torch.randn(shape, generator=_SEEDED) for shape in ((2, 2, 24, 3, 4), (2, 2, 24), (2, 3, 42, 56))
@@ -46,8 +46,8 @@ def unit(*xyz: float) -> np.ndarray:
     return np.array(xyz) / np.linalg.norm(xyz)
 
 
-def fields(*downs: tuple[float, float, float], focal_px: float = 60.0) -> torch.Tensor:
-    return gravity_field(torch.tensor(downs), torch.full((len(downs),), focal_px), ROWS, 98)
+def fields(*gravities: tuple[float, float, float], focal_px: float = 60.0) -> torch.Tensor:
+    return gravity_field(torch.tensor(gravities), torch.full((len(gravities),), focal_px), ROWS, 98)
 
 
 def test_the_field_is_the_sine_of_the_angle_below_the_horizon() -> None:
@@ -64,43 +64,43 @@ def test_the_field_is_the_sine_of_the_angle_below_the_horizon() -> None:
 
 
 def test_the_field_of_a_pitched_camera_and_of_one_with_a_middle_block() -> None:
-    down = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.5**0.5, 0.5**0.5]])
-    level, pitched = gravity_field(down, torch.full((2,), 50.0), 63, 77)[:, 0, 4, 5]
+    gravity_c = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.5**0.5, 0.5**0.5]])
+    level, pitched = gravity_field(gravity_c, torch.full((2,), 50.0), 63, 77)[:, 0, 4, 5]
     assert float(level) == pytest.approx(0.0, abs=1e-7)
     assert float(pitched) == pytest.approx(np.sin(np.radians(45)), abs=1e-6)
 
 
-def test_of_unknown_gravity_nothing_is_told() -> None:
+def test_the_field_of_unknown_gravity_is_zero() -> None:
     known, unknown = fields((0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
     assert bool(known.any())
     assert not bool(unknown.any())
 
 
-def test_an_untrained_head_is_not_moved_by_gravity_and_a_trained_one_is() -> None:
+def test_gravity_changes_the_prediction_of_a_trained_head_only() -> None:
     torch.manual_seed(2)
     head = DepthHead(SHAPE).eval()
-    deaf = DepthHead(replace(SHAPE, gravity=False)).eval()
-    told = gravity_field(torch.tensor([[0.0, 0.8, 0.6], [0.6, 0.8, 0.0]]), torch.full((2,), 50.0), 42, 56)
-    assert head.level is not None
+    without = DepthHead(replace(SHAPE, gravity=False)).eval()
+    field = gravity_field(torch.tensor([[0.0, 0.8, 0.6], [0.6, 0.8, 0.0]]), torch.full((2,), 50.0), 42, 56)
+    assert head.scale_branch is not None
     assert head.field is not None
-    torch.nn.init.normal_(head.level.out.weight)
+    torch.nn.init.normal_(head.scale_branch.out.weight)
     torch.nn.init.normal_(head.out.weight)
-    extra = deaf.load_state_dict(head.state_dict(), strict=False).unexpected_keys
-    assert {name.rpartition(".")[0] for name in extra} == {"level.gravity", "field"}
+    extra = without.load_state_dict(head.state_dict(), strict=False).unexpected_keys
+    assert {name.rpartition(".")[0] for name in extra} == {"scale_branch.gravity", "field"}
     with torch.inference_mode():
-        torch.testing.assert_close(head(*ARGS, told), deaf(*ARGS))
-        torch.nn.init.normal_(head.level.gravity.weight)
-        unmoved, level = deaf.coarse(*ARGS)[0][:, 0], head.coarse(*ARGS, told)[0][:, 0]
-        assert float((level - unmoved).mean(dim=(1, 2)).abs().min()) > 0.05
+        torch.testing.assert_close(head(*ARGS, field), without(*ARGS))
+        torch.nn.init.normal_(head.scale_branch.gravity.weight)
+        unmoved, rescaled = without.coarse(*ARGS)[0][:, 0], head.coarse(*ARGS, field)[0][:, 0]
+        assert float((rescaled - unmoved).mean(dim=(1, 2)).abs().min()) > 0.05
         torch.nn.init.normal_(head.field.weight)
-        relief = head.coarse(*ARGS, told)[0][:, 0]
-        torch.testing.assert_close(relief.mean(dim=(1, 2)), level.mean(dim=(1, 2)))
-        assert float((relief - level).abs().max()) > 0.05
-        torch.testing.assert_close(head(*ARGS), head(*ARGS, torch.zeros_like(told)))
-        torch.testing.assert_close(head(*ARGS), deaf(*ARGS))
+        reshaped = head.coarse(*ARGS, field)[0][:, 0]
+        torch.testing.assert_close(reshaped.mean(dim=(1, 2)), rescaled.mean(dim=(1, 2)))
+        assert float((reshaped - rescaled).abs().max()) > 0.05
+        torch.testing.assert_close(head(*ARGS), head(*ARGS, torch.zeros_like(field)))
+        torch.testing.assert_close(head(*ARGS), without(*ARGS))
 
 
-def test_gravity_comes_back_from_the_file_and_needs_a_level(tmp_path: Path) -> None:
+def test_a_head_that_reads_gravity_comes_back_from_its_file(tmp_path: Path) -> None:
     torch.manual_seed(3)
     model = HeadEnsemble(replace(SHAPE, members=2))
     for member in model.members:
@@ -108,19 +108,22 @@ def test_gravity_comes_back_from_the_file_and_needs_a_level(tmp_path: Path) -> N
     save_head(tmp_path / "h.safetensors", model, {})
     loaded, about = load_head(tmp_path / "h.safetensors")
     assert loaded.shape == replace(SHAPE, members=2)
-    assert about["format"] == "slamdepth-depth-head-5"
-    told = fields((0.0, 0.8, 0.6), (0.6, 0.8, 0.0))[:, :, :6, :8]
+    assert about["format"] == "slamdepth-depth-head-6"
+    field = fields((0.0, 0.8, 0.6), (0.6, 0.8, 0.0))[:, :, :6, :8]
     with torch.inference_mode():
-        log_depth, _ = loaded(*ARGS, told)
-        outs = [member(*ARGS, told)[:, 0] for member in loaded.members]
+        log_depth, _ = loaded(*ARGS, field)
+        outs = [member(*ARGS, field)[:, 0] for member in loaded.members]
         assert float((log_depth - loaded(*ARGS)[0]).abs().max()) > 1e-4
     torch.testing.assert_close(log_depth, (outs[0] + outs[1]) / 2)
-    with pytest.raises(ValueError, match="needs a level_dim above 0"):
-        DepthHead(replace(SHAPE, level_dim=0))
-    shape = json.dumps({**asdict(SHAPE), "level_dim": 0})
-    about = {"format": "slamdepth-depth-head-5", "shape": shape, "sigma_scale": "1.0"}
+
+
+def test_a_head_that_reads_gravity_needs_a_scale_branch(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="needs a scale_dim above 0"):
+        DepthHead(replace(SHAPE, scale_dim=0))
+    shape = json.dumps({**asdict(SHAPE), "scale_dim": 0})
+    about = {"format": FORMAT, "shape": shape, "sigma_scale": "1.0"}
     save_file({"a": torch.zeros(1)}, tmp_path / "bad.safetensors", metadata=pack_about(about))
-    with pytest.raises(WeightsError, match="needs a level_dim above 0"):
+    with pytest.raises(WeightsError, match="needs a scale_dim above 0"):
         load_head(tmp_path / "bad.safetensors")
 
 
@@ -165,7 +168,7 @@ def test_down_is_what_the_place_says_or_else_what_lines_tell_and_is_remembered(
         looked.append(camera)
         return None if len(looked) == 1 else unit(0, 0.8, 0.6)
 
-    monkeypatch.setattr(gravity, "held_upright_down", lines)
+    monkeypatch.setattr(gravity, "gravity_if_upright", lines)
     monkeypatch.setattr(gravity, "_found", {})
     monkeypatch.setattr(gravity, "_MOST_REMEMBERED", 2)
     place = with_gravity(tmp_path / "room", unit(0, 1, 0))
@@ -266,7 +269,7 @@ def mixing(*places: Place) -> tuple[ViewConfig, list[Partner]]:
 def test_what_is_mixed_into_a_view_shares_its_gravity(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gravity, "held_upright_down", lambda image_rgb, camera: None)
+    monkeypatch.setattr(gravity, "gravity_if_upright", lambda image_rgb, camera: None)
     rolled = with_gravity(tmp_path / "rolled", *[unit(1, 0.1, 0.05)] * 4)
     level = with_gravity(tmp_path / "level", *[unit(0, 1, 0)] * 4)
     steep = with_gravity(tmp_path / "steep", *[unit(0, 0.2, 0.9)] * 4)
@@ -310,10 +313,10 @@ def test_only_what_a_sample_teaches_is_learnt(relief: float, level: float) -> No
     total_loss(
         taught(prediction, target, torch.tensor([[relief, level]] * 2)), target, LossConfig()
     ).backward()
-    assert head.level is not None
+    assert head.scale_branch is not None
     assert head.out.weight.grad is not None
     of_relief = head.out.weight.grad[0].abs().max()  # log depth; the other row is its spread
-    of_level = head.level.out.bias.grad.abs().max()
+    of_level = head.scale_branch.out.bias.grad.abs().max()
     for found, is_taught in ((of_relief, relief), (of_level, level)):
         assert float(found) > 1e-3 if is_taught else float(found) < 1e-6  # rounding
 
@@ -390,7 +393,7 @@ def test_a_head_learns_with_gravity_the_same_for_the_same_seed(
     head, _ = load_head(result.output)
     assert head.shape.gravity
     assert bool(head.members[0].field.weight.any())
-    assert bool(head.members[0].level.gravity.weight.any())
+    assert bool(head.members[0].scale_branch.gravity.weight.any())
     assert loop.train_depth(config, backbone=tiny_backbone()).output.read_bytes() == first
 
 

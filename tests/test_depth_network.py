@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -191,12 +191,14 @@ def test_head_file_round_trip(tmp_path: Path) -> None:
     assert (tmp_path / "h.safetensors").read_bytes() == first
 
 
-def test_a_doubt_says_with_all_members_how_sure_they_are_and_comes_back_from_the_file(tmp_path: Path) -> None:
+def test_the_uncertainty_network_is_averaged_with_the_members_and_comes_back_from_the_file(
+    tmp_path: Path,
+) -> None:
     torch.manual_seed(1)
-    model = HeadEnsemble(replace(SMALL, doubt=4), sigma_scale=2.0).eval()
-    assert model.doubt is not None
-    torch.nn.init.zeros_(model.doubt.out.weight)
-    torch.nn.init.constant_(model.doubt.out.bias, math.log(0.5) + 2)
+    model = HeadEnsemble(replace(SMALL, uncertainty_dim=4), sigma_scale=2.0).eval()
+    assert model.uncertainty is not None
+    torch.nn.init.zeros_(model.uncertainty.out.weight)
+    torch.nn.init.constant_(model.uncertainty.out.bias, math.log(0.5) + 2)
     for member, own in zip(model.members, (0.2, 0.05), strict=True):
         torch.nn.init.zeros_(member.out.weight)
         member.out.bias = torch.nn.Parameter(torch.tensor([0.0, math.log(own)]))
@@ -211,30 +213,31 @@ def test_a_doubt_says_with_all_members_how_sure_they_are_and_comes_back_from_the
     torch.testing.assert_close(sigma, torch.full_like(sigma, 2.0 * 2.0**0.5 * spread), rtol=2e-3, atol=0)
 
 
-def level_and_relief(head: DepthHead, tokens: torch.Tensor, cls: torch.Tensor) -> tuple[float, torch.Tensor]:
+def scale_and_shape(head: DepthHead, tokens: torch.Tensor, cls: torch.Tensor) -> tuple[float, torch.Tensor]:
+    """Mean log depth, and the deviation from it."""
     with torch.inference_mode():
         log_depth = head.coarse(tokens, cls, torch.zeros(1, 3, 42, 56))[0][0, 0]
     return float(log_depth.mean()), log_depth - log_depth.mean()
 
 
-def test_a_level_told_apart_reads_what_is_common_to_a_view_and_its_relief_does_not() -> None:
+def test_what_all_tokens_have_in_common_changes_the_scale_and_not_the_shape() -> None:
     torch.manual_seed(4)
-    head = DepthHead(replace(SMALL, level_dim=4)).eval()
+    head = DepthHead(replace(SMALL, scale_dim=4)).eval()
     tokens, cls, common = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 2, 24, 1, 1)
-    level, relief = level_and_relief(head, tokens, cls)
-    assert level == pytest.approx(math.log(1.8), abs=1e-5)  # as it starts
-    torch.nn.init.normal_(head.level.out.weight)
-    other_level, same_relief = level_and_relief(head, tokens + common, cls)
-    assert abs(other_level - level) > 0.01
-    torch.testing.assert_close(same_relief, relief, atol=1e-5, rtol=1e-4)
-    assert level_and_relief(head, tokens, cls + 1)[0] == level_and_relief(head, tokens, cls)[0]
+    scale, shape = scale_and_shape(head, tokens, cls)
+    assert scale == pytest.approx(math.log(1.8), abs=1e-5)  # untrained
+    torch.nn.init.normal_(head.scale_branch.out.weight)
+    other_scale, same_shape = scale_and_shape(head, tokens + common, cls)
+    assert abs(other_scale - scale) > 0.01
+    torch.testing.assert_close(same_shape, shape, atol=1e-5, rtol=1e-4)
+    assert scale_and_shape(head, tokens, cls + 1)[0] == scale_and_shape(head, tokens, cls)[0]
 
 
-def test_levels_are_averaged_too_and_come_back_from_the_file(tmp_path: Path) -> None:
+def test_scales_of_members_are_averaged_and_come_back_from_the_file(tmp_path: Path) -> None:
     torch.manual_seed(5)
-    model = HeadEnsemble(replace(SMALL, level_dim=4, doubt=4))
+    model = HeadEnsemble(replace(SMALL, scale_dim=4, uncertainty_dim=4))
     for member, depth_m in zip(model.members, (1.0, 4.0), strict=True):
-        torch.nn.init.constant_(member.level.out.bias, math.log(depth_m))
+        torch.nn.init.constant_(member.scale_branch.out.bias, math.log(depth_m))
     save_head(tmp_path / "h.safetensors", model, {})
     loaded, _ = load_head(tmp_path / "h.safetensors")
     args = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56)
@@ -245,29 +248,14 @@ def test_levels_are_averaged_too_and_come_back_from_the_file(tmp_path: Path) -> 
     torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
 
 
-@pytest.mark.parametrize(
-    ("number", "without"),
-    [(1, {"doubt", "level_dim", "gravity"}), (2, {"level_dim", "gravity"}), (3, {"gravity"})],
-)
-def test_heads_of_earlier_formats_are_read(tmp_path: Path, number: int, without: set[str]) -> None:
-    model = HeadEnsemble(SMALL)
-    tensors = {name: value.half().contiguous() for name, value in model.state_dict().items()}
-    shape = {name: value for name, value in asdict(SMALL).items() if name not in without}
-    about = {"format": f"slamdepth-depth-head-{number}", "shape": json.dumps(shape), "sigma_scale": "1.5"}
-    save_file(tensors, tmp_path / "old.safetensors", metadata=pack_about(about))
-    loaded, _ = load_head(tmp_path / "old.safetensors")
-    assert loaded.doubt is None
-    assert loaded.sigma_scale == 1.5
-
-
-@pytest.mark.parametrize("part", ["doubt", "level_dim"])
-def test_heads_of_earlier_formats_whose_parts_were_others_are_refused(tmp_path: Path, part: str) -> None:
-    shape = replace(SMALL, **{part: 4})
-    tensors = {name: value.half().contiguous() for name, value in HeadEnsemble(shape).state_dict().items()}
-    about = {"format": "slamdepth-depth-head-4", "shape": json.dumps(asdict(shape)), "sigma_scale": "1.0"}
-    save_file(tensors, tmp_path / "old.safetensors", metadata=pack_about(about))
-    with pytest.raises(WeightsError, match=r"earlier version of slamdepth .* train it again"):
-        load_head(tmp_path / "old.safetensors")
+@pytest.mark.parametrize("number", [1, 5, 7])
+def test_heads_of_other_formats_are_refused(tmp_path: Path, number: int) -> None:
+    tensors = {name: value.half().contiguous() for name, value in HeadEnsemble(SMALL).state_dict().items()}
+    shape = json.dumps({"taps": [0, 2], "doubt": 4, "level_dim": 4})
+    about = {"format": f"slamdepth-depth-head-{number}", "shape": shape, "sigma_scale": "1.0"}
+    save_file(tensors, tmp_path / "other.safetensors", metadata=pack_about(about))
+    with pytest.raises(WeightsError, match=rf"other\.safetensors: .* version .*-{number},.* train it again"):
+        load_head(tmp_path / "other.safetensors")
 
 
 def test_head_file_of_another_kind_is_refused(tmp_path: Path) -> None:

@@ -30,8 +30,8 @@ from slamdepth.training.config import TrainConfig
 from slamdepth.types import Camera, Frame
 
 SHAPE = HeadShape(
-    taps=(0, 1), token_dim=24, dim=16, guide_dim=8, members=2, doubt=8, level_dim=4, input_px=5000,
-    gravity=True, down_dim=8,
+    taps=(0, 1), token_dim=24, dim=16, guide_dim=8, members=2, uncertainty_dim=8, scale_dim=4, input_px=5000,
+    gravity=True, gravity_dim=8,
 )  # fmt: skip
 
 

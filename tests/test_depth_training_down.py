@@ -13,7 +13,7 @@ import torch
 from killed_training import tiny_backbone
 from training_places import make_place
 
-from slamdepth.depth.gravity_direction import DownEstimate
+from slamdepth.depth.gravity_direction import GravityEstimate
 from slamdepth.depth.head import HeadEnsemble, HeadShape, load_head
 from slamdepth.depth.model import Dinov2Depth
 from slamdepth.errors import ConfigError
@@ -26,7 +26,7 @@ from slamdepth.training.gravity_direction import learn_down, offered_directions
 from slamdepth.training.progress import silent
 from slamdepth.types import Camera, Frame
 
-SHAPE = HeadShape(taps=(0,), token_dim=8, level_dim=4, gravity=True, down_dim=16)
+SHAPE = HeadShape(taps=(0,), token_dim=8, scale_dim=4, gravity=True, gravity_dim=16)
 
 
 def seen_from_below_the_horizon(count: int, seed: int) -> FeatureCache:
@@ -147,28 +147,28 @@ def test_a_trained_head_knows_which_way_is_down(settings: dict[str, Any], tmp_pa
         config = TrainConfig.from_dict({**settings, "output": str(output)})
         loop.train_depth(config, backbone=tiny_backbone())
         head, _ = load_head(output)
-        assert head.down is not None
+        assert head.gravity is not None
         written.append(head.state_dict())
     assert all(torch.equal(value, written[1][name]) for name, value in written[0].items())
     untrained = HeadEnsemble(head.shape)
-    assert untrained.down is not None
-    assert not torch.equal(untrained.down.out.weight, written[0]["down.out.weight"])
+    assert untrained.gravity is not None
+    assert not torch.equal(untrained.gravity.out.weight, written[0]["gravity.out.weight"])
 
 
 class Told(Dinov2Depth):
     """A model that is told where down is."""
 
-    told: DownEstimate | None = None
+    told: GravityEstimate | None = None
 
-    def _down(self, frame: Frame, looks: Any) -> DownEstimate | None:
-        del frame, looks
+    def _gravity(self, frame: Frame, rotations: Any) -> GravityEstimate | None:
+        del frame, rotations
         return self.told
 
 
 def model() -> Told:
     torch.manual_seed(3)
     shape = HeadShape(
-        taps=(0, 1), token_dim=24, dim=16, guide_dim=8, level_dim=4, gravity=True, input_px=5000
+        taps=(0, 1), token_dim=24, dim=16, guide_dim=8, scale_dim=4, gravity=True, input_px=5000
     )
     head = HeadEnsemble(shape)
     for parameter in head.parameters():
@@ -183,9 +183,9 @@ def frame() -> Frame:
 
 def test_depth_depends_on_where_down_is() -> None:
     unknown, level = model(), model()
-    level.told = DownEstimate(np.array([0.0, 1.0, 0.0]), 1.0)
+    level.told = GravityEstimate(np.array([0.0, 1.0, 0.0]), 1.0)
     pitched = model()
-    pitched.told = DownEstimate(np.array([0.0, 0.6, 0.8]), 1.0)
+    pitched.told = GravityEstimate(np.array([0.0, 0.6, 0.8]), 1.0)
     depths = [each.predict(frame()).values for each in (unknown, level, pitched)]
     assert not np.allclose(depths[0], depths[1])
     assert not np.allclose(depths[1], depths[2])
@@ -194,8 +194,8 @@ def test_depth_depends_on_where_down_is() -> None:
 def test_a_rolled_image_is_predicted_upright() -> None:
     """Half a turn is exact: what is predicted is that of the image turned back, the other way round."""
     upright, rolled = model(), model()
-    upright.told = DownEstimate(np.array([0.0, 0.8, 0.6]), 1.0)
-    rolled.told = DownEstimate(np.array([0.0, -0.8, 0.6]), 1.0)
+    upright.told = GravityEstimate(np.array([0.0, 0.8, 0.6]), 1.0)
+    rolled.told = GravityEstimate(np.array([0.0, -0.8, 0.6]), 1.0)
     as_taken = frame()
     turned = replace(as_taken, image_rgb=np.ascontiguousarray(as_taken.image_rgb[::-1, ::-1]))
     wanted = upright.predict(as_taken)
@@ -209,7 +209,14 @@ def test_a_rolled_image_is_predicted_upright() -> None:
 def test_a_blank_image_tells_no_direction() -> None:
     torch.manual_seed(3)
     shape = HeadShape(
-        taps=(0, 1), token_dim=24, dim=16, guide_dim=8, level_dim=4, gravity=True, down_dim=8, input_px=5000
+        taps=(0, 1),
+        token_dim=24,
+        dim=16,
+        guide_dim=8,
+        scale_dim=4,
+        gravity=True,
+        gravity_dim=8,
+        input_px=5000,
     )
     blank = replace(frame(), image_rgb=np.full((96, 128, 3), 128, np.uint8))
     told = Dinov2Depth(tiny_backbone(), HeadEnsemble(shape).eval(), ())

@@ -13,7 +13,7 @@ from killed_training import tiny_backbone
 from training_places import make_place
 
 from slamdepth.depth.head import load_head
-from slamdepth.depth.uncertainty import FEATURES, Doubt, features, together
+from slamdepth.depth.uncertainty import FEATURES, UncertaintyNet, features, mean_log_spread
 from slamdepth.errors import ConfigError
 from slamdepth.training import loop, out_of_fold, timing
 from slamdepth.training.caches import Encoder, plan_caches
@@ -70,7 +70,7 @@ def made_up_errors(seed: int = 0, places: int = 3) -> Errors:
 def test_it_learns_where_errors_are_large_and_how_large() -> None:
     doubt = fit_doubt(made_up_errors(), seed=0)
     other = made_up_errors(seed=1)
-    judged = doubt.judge(read_by(doubt, other))
+    judged = doubt.log_spread(read_by(doubt, other))
     assert surest_half(judged, other) < 0.4  # of 1 and 6 in equal parts: 1 / 3.5 = 0.29
     assert surest_half(other.own, other) == pytest.approx(1, abs=0.1)
     torch.testing.assert_close(spread_of(doubt, other), (other.own + judged) / 2)
@@ -89,8 +89,8 @@ def test_the_map_is_read_as_its_pixels_are() -> None:
     whole = doubt(tokens, log_depth, own, sine)
     assert whole.shape == (2, 6, 8)
     seen = doubt.basis @ (tokens[1, :, 2, 1] - doubt.centre)
-    one = torch.cat([seen, doubt.scaled(features(log_depth, own, sine))[1, 5, 2]])
-    torch.testing.assert_close(whole[1, 5, 2], together(own[1, 5, 2], doubt.judge(one)))
+    one = torch.cat([seen, doubt.standardised(features(log_depth, own, sine))[1, 5, 2]])
+    torch.testing.assert_close(whole[1, 5, 2], mean_log_spread(own[1, 5, 2], doubt.log_spread(one)))
 
 
 def test_what_is_read_is_free_of_the_scale_of_a_frame() -> None:
@@ -152,7 +152,7 @@ def test_a_head_with_a_doubt_is_made_judged_and_planned(settings: dict[str, Any]
     assert plan.steps == 3 * 3 + 2 * (1 + 2)  # 12 views; one fold has the 4 of loft, one the 8 of hall
     result = loop.train_depth(config, backbone=tiny_backbone())
     head, _ = load_head(result.output)
-    assert isinstance(head.doubt, Doubt)
+    assert isinstance(head.uncertainty, UncertaintyNet)
     assert head.sigma_scale == result.sigma_scale > 0
     assert set(result.unseen_surest_half) == {"hall", "loft"}
     assert set(result.unseen_surest_half["loft"]) == {"out_of_fold", "own", "relief"}
@@ -170,7 +170,7 @@ def test_a_plan_counts_the_time_of_every_fit(
     steps: list[int | None] = []
     real = out_of_fold.fit_doubt
 
-    def fit(errors: Errors, seed: int, **more: Any) -> Doubt:
+    def fit(errors: Errors, seed: int, **more: Any) -> UncertaintyNet:
         steps.append(more.get("steps"))
         return real(errors, seed, **more)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directions that straight lines run along, on drawings of rooms seen by cameras turned as is known."""
+"""Manhattan frames of drawings of rooms, seen by cameras of known orientation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slamdepth.depth.vanishing import Lines, ManhattanFrame, find_lines, held_upright_down, manhattan_frames
+from slamdepth.depth.vanishing import Lines, ManhattanFrame, find_lines, gravity_if_upright, manhattan_frames
 from slamdepth.geometry import so3_exp
 from slamdepth.types import Camera
 
@@ -18,7 +18,7 @@ UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # columns: right, down
 
 
 def held(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
-    """``R_world_camera`` of a camera that looks down by its pitch; "down" turns to the right by its roll."""
+    """``R_world_camera`` of a camera that looks down by its pitch, with gravity to the right by its roll."""
     turns = ([0, yaw_deg, 0], [-pitch_deg, 0, 0], [0, 0, roll_deg])
     yaw, pitch, roll = (so3_exp(np.radians(turn)) for turn in turns)
     return UPRIGHT @ yaw @ pitch @ roll
@@ -77,7 +77,7 @@ def best(image: np.ndarray, camera: Camera) -> ManhattanFrame:
 
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
 @pytest.mark.parametrize("seed", range(6))
-def test_a_room_tells_its_three_directions_however_it_is_seen(camera: Camera, seed: int) -> None:
+def test_the_three_directions_of_a_room_are_found_from_any_viewpoint(camera: Camera, seed: int) -> None:
     R = any_turn(seed)
     found = best(drawn(segments(seed, 120), R, camera), camera)  # some along each side are in view
     assert off_deg(found, R) < WITHIN_DEG
@@ -103,7 +103,7 @@ def test_the_same_lines_give_the_same_bytes(roll_deg: float) -> None:
         assert one.support.tobytes() == other.support.tobytes()
 
 
-def test_too_few_lines_tell_nothing() -> None:
+def test_too_few_lines_give_no_frame() -> None:
     blank = np.full((240, 320, 3), 128, np.uint8)
     camera = CAMERA.scaled(320, 240)
     assert len(find_lines(blank, camera)) == 0
@@ -114,7 +114,7 @@ def test_too_few_lines_tell_nothing() -> None:
     assert manhattan_frames(few) == []
 
 
-def test_lines_all_alike_tell_nothing() -> None:
+def test_parallel_lines_alone_give_no_frame() -> None:
     normal = np.tile([0.0, 1.0, 0.0], (20, 1))
     assert manhattan_frames(Lines(normal, np.tile([0.0, 0.0, 1.0], (20, 1)), np.full(20, 0.1))) == []
 
@@ -132,19 +132,19 @@ def test_lines_are_planes_through_the_camera() -> None:
     ("pitch_deg", "roll_deg"), [(0, 0), (0, 30), (0, -30), (40, 0), (-40, 0), (40, 15), (30, 30), (25, -30)]
 )
 @pytest.mark.parametrize("yaw_deg", [12, 40])
-def test_an_image_held_upright_tells_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> None:
+def test_gravity_is_found_in_an_image_held_upright(yaw_deg: float, pitch_deg: float, roll_deg: float) -> None:
     R = held(yaw_deg, pitch_deg, roll_deg)
     true = -R[2]
     assert np.degrees(np.arctan2(true[0], true[1])) == pytest.approx(roll_deg, abs=1e-6)
     assert np.degrees(np.arcsin(true[2])) == pytest.approx(pitch_deg)
-    down = held_upright_down(drawn(segments(5, 60), R, CAMERA), CAMERA)
-    assert down is not None
-    assert np.linalg.norm(down) == pytest.approx(1.0)
-    assert np.degrees(np.arccos(min(1.0, down @ true))) < WITHIN_DEG
+    gravity_c = gravity_if_upright(drawn(segments(5, 60), R, CAMERA), CAMERA)
+    assert gravity_c is not None
+    assert np.linalg.norm(gravity_c) == pytest.approx(1.0)
+    assert np.degrees(np.arccos(min(1.0, gravity_c @ true))) < WITHIN_DEG
 
 
-def test_a_blank_image_has_no_down() -> None:
-    assert held_upright_down(np.full((480, 640, 3), 90, np.uint8), CAMERA) is None
+def test_a_blank_image_gives_no_gravity() -> None:
+    assert gravity_if_upright(np.full((480, 640, 3), 90, np.uint8), CAMERA) is None
 
 
 def test_frames_differ_and_come_by_how_many_lines_run_along_them() -> None:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which way is down in one image: lines offer directions, a small network says which of them it is.
+"""The direction of gravity in one image: straight lines propose directions, a small network scores them.
 
-Straight lines tell directions in space to a few degrees, but not which of them is vertical, nor its
-sense. What is seen does: floors are below, ceilings above, desks are seen from above. So each direction
-that lines offer (:mod:`slamdepth.depth.vanishing`) is shown to a network beside the backbone's tokens, as
-the field of how far below the horizon every token would be if it were down; the network scores how well
-the two go together. A camera that is held upright is more likely than one that is not.
+Straight lines give directions in space to a few degrees, but neither which of them is vertical nor its
+sense. Semantics does: floors are below, ceilings above, desks are seen from above. Each direction that the
+lines propose (:mod:`slamdepth.depth.vanishing`) is turned into a gravity field, which says how far below the
+horizon each token would be if it were gravity; the network scores how well field and tokens agree. The prior
+is a camera held roughly upright.
 """
 
 from __future__ import annotations
@@ -26,138 +26,162 @@ from slamdepth.geometry import so3_exp
 from slamdepth.typing import Floats
 
 FRAMES = 12
-"""Manhattan frames whose axes are offered."""
+"""Number of Manhattan frames whose axes are proposed."""
 _SUPPORT_WEIGHT = 30.0  # log odds per share of the lines that run along a frame
-_USUAL = np.array([0.0, np.cos(np.radians(20.0)), np.sin(np.radians(20.0))])
+_PRIOR_GRAVITY = np.array([0.0, np.cos(np.radians(20.0)), np.sin(np.radians(20.0))])
 """Gravity in a camera that is held upright and looks a little down."""
-_AWAY_RAD = np.radians(45.0)  # a direction as much farther from it is e times as unlikely
-_SAME = np.cos(np.radians(20.0))
-_ALIKE = np.cos(np.radians(25.0))
-_LOOKED_AT = 2
-_NOT_LIKELY = 0.01
+_PRIOR_ANGLE_RAD = np.radians(45.0)  # by so much farther from the prior is e times less likely
+_COS_SAME = np.cos(np.radians(20.0))
+_COS_ALIKE = np.cos(np.radians(25.0))
+_ROTATIONS = 2
+_MIN_PROBABILITY = 0.01
 
 
 @dataclass(frozen=True)
-class DownEstimate:
+class GravityEstimate:
     """Direction of gravity in an image.
 
     Attributes:
-        down: ``(3,)``, unit, in the camera's frame (x right, y down, z forward).
-        share: how much of the belief it is the mean of, 0 to 1.
+        gravity: ``(3,)`` unit vector in the camera's frame (x right, y down, z forward).
+        share: probability of the directions it is the mean of, 0 to 1.
     """
 
-    down: Floats
+    gravity: Floats
     share: float
 
 
-class DownScorer(nn.Module):
-    """Scores directions of gravity by the tokens of an image. ``dropout`` works in training only."""
+class GravityScorer(nn.Module):
+    """Scores candidate directions of gravity given the tokens of an image.
+
+    Args:
+        width: channels of all tapped blocks together.
+        dim: channels of the hidden layers.
+        dropout: share of token channels dropped; works in training only.
+    """
 
     def __init__(self, width: int, dim: int, dropout: float = 0.0) -> None:
         super().__init__()
         self.drop = nn.Dropout2d(dropout)
         self.tokens = nn.Conv2d(width, dim, 1)
-        self.around = nn.Conv2d(dim, dim, 3, padding=1)
+        self.context = nn.Conv2d(dim, dim, 3, padding=1)
         self.field = nn.Conv2d(GRAVITY_CHANNELS, dim, 1)
-        self.together = nn.Conv2d(dim, dim, 3, padding=1)
+        self.joint = nn.Conv2d(dim, dim, 3, padding=1)
         self.out = nn.Linear(dim, 1)
 
     def forward(self, tokens: Tensor, fields: Tensor) -> Tensor:
-        """Scores ``(B, C)`` of ``C`` directions each.
+        """Scores ``(B, C)`` of ``C`` candidate directions for each image.
 
         Args:
             tokens: ``(B, taps, dim, h, w)``.
-            fields: ``(B, C, 4, h, w)``, their :func:`gravity_field` a token.
+            fields: ``(B, C, 4, h, w)``, the gravity field of each candidate, one value per token; see
+                :func:`token_fields`.
         """
-        seen = F.gelu(self.tokens(self.drop(tokens.flatten(1, 2))))
-        seen = seen + F.gelu(self.around(seen))
+        image = F.gelu(self.tokens(self.drop(tokens.flatten(1, 2))))
+        image = image + F.gelu(self.context(image))
         field = self.field(fields.flatten(0, 1)).unflatten(0, fields.shape[:2])
-        both = F.gelu(seen[:, None] * field).flatten(0, 1)
-        both = F.gelu(both + self.together(both))
+        both = F.gelu(image[:, None] * field).flatten(0, 1)
+        both = F.gelu(both + self.joint(both))
         scores: Tensor = self.out(both.mean(dim=(2, 3)))
         return scores.reshape(fields.shape[:2])
 
 
 @dataclass(frozen=True)
-class Look:
-    """An image as the backbone saw it.
+class EncodedImage:
+    """The backbone's tokens of an image that may have been rotated about its principal point.
 
     Attributes:
         tokens: ``(1, taps, dim, h, w)``.
         size: rows and columns of the network's input.
-        focal_px: in pixels of that.
-        turn_rad: it was turned upright from this roll; 0 as taken.
+        focal_px: focal length in pixels of the network's input.
+        roll_rad: roll of the camera that the rotation undid, see :func:`~slamdepth.depth.upright.roll_rad`; 0
+            for the image as taken.
     """
 
     tokens: Tensor
     size: tuple[int, int]
     focal_px: float
-    turn_rad: float = 0.0
+    roll_rad: float = 0.0
 
-    def seen(self, directions: Floats) -> Floats:
-        """Directions ``(..., 3)`` of the camera that took the image, as they are in the turned one."""
-        return directions @ so3_exp(np.array([0.0, 0.0, self.turn_rad])).T
+    def rotated(self, directions: Floats) -> Floats:
+        """Directions ``(..., 3)`` of the camera that took the image, in the frame of the rotated image."""
+        rotated: Floats = directions @ so3_exp(np.array([0.0, 0.0, self.roll_rad])).T
+        return rotated
 
 
 def token_fields(directions: Tensor, focal_px: float, rows: int, columns: int) -> Tensor:
-    """:func:`gravity_field` ``(C, 4, rows/14, columns/14)`` of directions ``(C, 3)``, a value a token."""
+    """Gravity fields with one value per token.
+
+    Args:
+        directions: ``(C, 3)`` unit vectors in the camera's frame.
+        focal_px: focal length in pixels of the network's input.
+        rows, columns: of the network's input.
+
+    Returns:
+        ``(C, 4, rows / 14, columns / 14)``; for the channels see
+        :func:`~slamdepth.depth.gravity_field.gravity_field`.
+    """
     focal = torch.full((len(directions),), focal_px, device=directions.device)
     return F.avg_pool2d(gravity_field(directions, focal, rows, columns), 2)
 
 
-def find_down(
-    scorer: DownScorer, frames: Sequence[ManhattanFrame], look: Callable[[float], Look]
-) -> DownEstimate | None:
-    """The likeliest direction of gravity; None where lines offer none.
+def estimate_gravity(
+    scorer: GravityScorer, frames: Sequence[ManhattanFrame], encode: Callable[[float], EncodedImage]
+) -> GravityEstimate | None:
+    """The most probable direction of gravity in an image; None where lines propose none.
 
-    It is the mean of the directions within 20 degrees of one, as much as is believed of each, where most
-    belief is: lines offer several that differ by a few degrees.
+    Lines propose several directions that differ by a few degrees. The estimate is the mean, weighted by
+    probability, of the directions within 20 degrees of one another that together are most probable.
 
-    The image is looked at as taken, and, where more than one direction is likely, turned as each of the two
-    likeliest says: what lies on its side is known better once it stands.
+    The scorer sees the image as taken. Where more than one direction is probable, it also sees the image
+    rotated upright by each of the two most probable ones, because upright images are recognised better.
 
     Args:
-        frames: what lines offer.
-        look: the image turned upright from a roll in radians, or about that.
+        scorer: scores directions given the tokens.
+        frames: the Manhattan frames whose axes are proposed.
+        encode: the image rotated upright from a roll in radians, or from about that roll.
     """
     if not frames:
         return None
-    offered = np.concatenate([np.concatenate([frame.axes, -frame.axes]) for frame in frames])
+    candidates = np.concatenate([np.concatenate([frame.axes, -frame.axes]) for frame in frames])
     support = np.repeat([frame.support.sum() for frame in frames], 6)
-    away = np.arccos(np.clip(offered @ _USUAL, -1.0, 1.0))
-    log_belief = _scores(scorer, look(0.0), offered) + _SUPPORT_WEIGHT * support - away / _AWAY_RAD
-    likeliest = _likeliest(offered, _shares(log_belief))
-    if len(likeliest) > 1:
-        for down in likeliest:
-            log_belief = log_belief + _scores(scorer, look(roll_rad(down)), offered)
-    belief = _shares(log_belief)
-    around = offered @ offered.T > _SAME
-    best = around[int((around @ belief).argmax())]
-    down = belief[best] @ offered[best]
-    return DownEstimate(down / np.linalg.norm(down), float(belief[best].sum()))
+    prior_angle = np.arccos(np.clip(candidates @ _PRIOR_GRAVITY, -1.0, 1.0))
+    log_probability = (
+        _log_likelihood(scorer, encode(0.0), candidates)
+        + _SUPPORT_WEIGHT * support
+        - prior_angle / _PRIOR_ANGLE_RAD
+    )
+    modes = _modes(candidates, _normalised(log_probability))
+    if len(modes) > 1:
+        for mode in modes:
+            log_probability = log_probability + _log_likelihood(scorer, encode(roll_rad(mode)), candidates)
+    probability = _normalised(log_probability)
+    is_near = candidates @ candidates.T > _COS_SAME
+    best = is_near[int((is_near @ probability).argmax())]
+    gravity = probability[best] @ candidates[best]
+    return GravityEstimate(gravity / np.linalg.norm(gravity), float(probability[best].sum()))
 
 
-def _scores(scorer: DownScorer, look: Look, offered: Floats) -> Floats:
-    """Log probability ``(C,)`` of each direction by what the image shows."""
-    directions = torch.from_numpy(look.seen(offered)).float().to(look.tokens.device)
+def _log_likelihood(scorer: GravityScorer, image: EncodedImage, candidates: Floats) -> Floats:
+    """Log probability ``(C,)`` of each candidate given the tokens alone."""
+    directions = torch.from_numpy(image.rotated(candidates)).float().to(image.tokens.device)
     with torch.inference_mode():
-        scores = scorer(look.tokens, token_fields(directions, look.focal_px, *look.size)[None])
+        scores = scorer(image.tokens, token_fields(directions, image.focal_px, *image.size)[None])
         return torch.log_softmax(scores[0], dim=0).cpu().numpy().astype(np.float64)
 
 
-def _shares(log_belief: Floats) -> Floats:
-    belief = np.exp(log_belief - log_belief.max())
-    return np.asarray(belief / belief.sum())
+def _normalised(log_probability: Floats) -> Floats:
+    probability = np.exp(log_probability - log_probability.max())
+    return np.asarray(probability / probability.sum())
 
 
-def _likeliest(offered: Floats, belief: Floats) -> list[Floats]:
-    """The likeliest directions that are far from one another."""
-    left, out = belief.copy(), []
-    for _ in range(_LOOKED_AT):
+def _modes(candidates: Floats, probability: Floats) -> list[Floats]:
+    """At most two most probable directions, at least 25 degrees from one another."""
+    left, out = probability.copy(), []
+    for _ in range(_ROTATIONS):
         best = int(left.argmax())
-        alike = offered @ offered[best] > _ALIKE
-        if left[alike].sum() < _NOT_LIKELY:
+        is_alike = candidates @ candidates[best] > _COS_ALIKE
+        if left[is_alike].sum() < _MIN_PROBABILITY:
             break
-        out.append(offered[best])
-        left[alike] = 0.0
+        out.append(candidates[best])
+        left[is_alike] = 0.0
     return out

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The depth head: DINOv2 tokens and the image in, log depth and its uncertainty out.
 
-Tokens of several blocks (and class tokens, where scale is not told apart) are mixed at 1/14 of the
-resolution, brought to 1/7 together with a strided view of the image, and upsampled to the full input
-as convex combinations of the 3 x 3 coarse neighbours (Teed and Deng, RAFT, ECCV 2020):
-the weights come from the image, so edges stay where the image has them.
+Tokens of several blocks (and class tokens, where there is no scale branch) are mixed at 1/14 of the
+resolution, brought to 1/7 together with a strided view of the image, and upsampled to the full input by
+convex combinations of the 3 x 3 coarse neighbours (Teed and Deng, RAFT, ECCV 2020). The weights come from
+the image, so edges stay where the image has them.
 """
 
 from __future__ import annotations
@@ -19,46 +19,46 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from slamdepth.depth.gravity_direction import DownScorer
+from slamdepth.depth.gravity_direction import GravityScorer
 from slamdepth.depth.head_layers import (
     FACTOR,
     GRAVITY_CHANNELS,
-    USUAL_DEPTH_M,
-    Level,
+    INITIAL_DEPTH_M,
     Residual,
+    ScaleBranch,
     convex_upsample,
     zeroed,
 )
 from slamdepth.depth.layout import check_layout, pack_about, unpack_about
-from slamdepth.depth.uncertainty import Doubt
+from slamdepth.depth.uncertainty import UncertaintyNet
 from slamdepth.errors import WeightsError
 
 UPSAMPLING = "weights."
 """Prefix of the parameters that only the upsampling to full resolution uses."""
-FORMAT = "slamdepth-depth-head-5"
-_EARLIER = tuple(f"slamdepth-depth-head-{number}" for number in range(1, 5))
-"""The first format had no ``doubt``, the second no ``level_dim`` and no ``input_px``, the third no
-``gravity`` and no ``down_dim``; up to the fourth the level read class tokens too, and a doubt not what the
-head says itself, so that such parts can no longer be read."""
+_FORMAT_NAME = "slamdepth-depth-head-"
+FORMAT = f"{_FORMAT_NAME}6"
 
 
 @dataclass(frozen=True)
 class HeadShape:
-    """What a head file needs to be built again.
+    """The shape of a head's network, as kept in the header of its file.
 
     Attributes:
-        taps: backbone blocks it reads, ascending.
+        taps: backbone blocks that are read, ascending.
         token_dim: width of the backbone.
-        dim, blocks, guide_dim: channels and residual convolutions, see ``HeadConfig``.
+        dim: channels at token resolution.
+        blocks: residual convolutions at token resolution.
+        guide_dim: channels that carry image edges to the upsampling.
         members: heads whose predictions are averaged.
-        doubt: components of the tokens read by :class:`~slamdepth.depth.uncertainty.Doubt`, which then
-            says with them how sure they are; 0 where the members alone do.
-        level_dim: channels of the branch that tells a view's mean log depth apart from its relief;
-            0 where one branch tells both.
-        input_px: rows times columns of the images it learnt from, and is given.
-        gravity: it is told where down is, by :func:`~slamdepth.depth.gravity_field.gravity_field`;
-            needs ``level_dim``.
-        down_dim: channels of the network that finds out which way is down; 0 where there is none.
+        uncertainty_dim: principal components of the tokens that an
+            :class:`~slamdepth.depth.uncertainty.UncertaintyNet` reads; 0 where there is none and each member
+            predicts its uncertainty alone.
+        scale_dim: channels of the branch that predicts a view's mean log depth (its scale), while the rest of
+            the head predicts its shape; 0 where one branch predicts both.
+        input_px: rows times columns of the images it was trained on, and is given.
+        gravity: a gravity field is read (:func:`~slamdepth.depth.gravity_field.gravity_field`); needs
+            ``scale_dim``.
+        gravity_dim: channels of the network that estimates the direction of gravity; 0 where there is none.
     """
 
     taps: tuple[int, ...] = (5, 8, 11)
@@ -67,33 +67,38 @@ class HeadShape:
     blocks: int = 1
     guide_dim: int = 64
     members: int = 1
-    doubt: int = 0
-    level_dim: int = 0
+    uncertainty_dim: int = 0
+    scale_dim: int = 0
     input_px: int = 238 * 322
     gravity: bool = False
-    down_dim: int = 0
+    gravity_dim: int = 0
 
 
 class DepthHead(nn.Module):
-    """One head. ``dropout`` works in training only.
+    """One head: log depth and its Laplace spread from tokens and image.
 
-    With ``level_dim`` relief and level are told apart: relief, of mean 0, by tokens less their mean
-    over the view, so that it cannot know a place by what is common to its tokens; the level by those
-    means. With ``gravity`` both are told how far below the horizon they look.
+    With ``shape.scale_dim`` the head has a shape branch and a scale branch. The shape branch predicts log
+    depth of mean 0 from the tokens less their mean over the view, so that it cannot recognise a place by what
+    its tokens have in common; the scale branch predicts the mean log depth from those means. With
+    ``shape.gravity`` both branches also read how far below the horizon each part of the view lies.
+
+    Args:
+        shape: of the network.
+        dropout: share of token channels dropped; works in training only.
 
     Raises:
-        ValueError: ``gravity`` without ``level_dim``.
+        ValueError: ``shape.gravity`` without ``shape.scale_dim``.
     """
 
     def __init__(self, shape: HeadShape, dropout: float = 0.0) -> None:
         super().__init__()
-        if shape.gravity and not shape.level_dim:
-            raise ValueError("a head that is told where down is needs a level_dim above 0")
+        if shape.gravity and not shape.scale_dim:
+            raise ValueError("a head that reads gravity needs a scale_dim above 0")
         width = len(shape.taps) * shape.token_dim
         self.drop = nn.Dropout2d(dropout)
         self.tokens = nn.Conv2d(width, shape.dim, 1)
-        self.level = Level(width, shape.level_dim, shape.gravity) if shape.level_dim else None
-        self.class_tokens = None if shape.level_dim else nn.Linear(width, shape.dim)
+        self.scale_branch = ScaleBranch(width, shape.scale_dim, shape.gravity) if shape.scale_dim else None
+        self.class_tokens = None if shape.scale_dim else nn.Linear(width, shape.dim)
         self.blocks = nn.ModuleList(Residual(shape.dim) for _ in range(shape.blocks))
         self.narrow = nn.Conv2d(shape.dim, shape.guide_dim, 1)
         self.guide = nn.Conv2d(3 * FACTOR * FACTOR, shape.guide_dim, 1)
@@ -101,25 +106,32 @@ class DepthHead(nn.Module):
         self.out = nn.Conv2d(shape.guide_dim, 2, 1)
         self.weights = nn.Conv2d(shape.guide_dim, 9 * FACTOR * FACTOR, 1)
         nn.init.normal_(self.out.weight, std=1e-3)
-        self.out.bias = nn.Parameter(torch.tensor([math.log(USUAL_DEPTH_M), math.log(0.3)]))
+        self.out.bias = nn.Parameter(torch.tensor([math.log(INITIAL_DEPTH_M), math.log(0.3)]))
         self.field = zeroed(nn.Conv2d(GRAVITY_CHANNELS, shape.dim, 1)) if shape.gravity else None
 
     def coarse(
         self, tokens: Tensor, class_tokens: Tensor, image: Tensor, field: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Log depth and log spread ``(B, 2, H/7, W/7)``, and what the upsampling needs.
+        """The prediction before the upsampling.
 
         Args:
-            field: ``(B, 4, H/7, W/7)``, 0 where gravity is unknown; None where it is for all.
+            tokens: ``(B, taps, dim, H/14, W/14)``.
+            class_tokens: ``(B, taps, dim)``.
+            image: ``(B, 3, H, W)``, ImageNet-normalised.
+            field: gravity field ``(B, 4, H/7, W/7)``, 0 where gravity is unknown; None: unknown for all.
+
+        Returns:
+            Log depth and log spread ``(B, 2, H/7, W/7)``, and the features that give the weights of the
+            upsampling, ``(B, guide_dim, H/7, W/7)``.
         """
         if field is None:
             rows, columns = image.shape[2] // FACTOR, image.shape[3] // FACTOR
             field = image.new_zeros(len(image), GRAVITY_CHANNELS, rows, columns)
         x = tokens.flatten(1, 2)
-        level = None
-        if self.level is not None:
+        scale = None
+        if self.scale_branch is not None:
             mean = x.mean(dim=(2, 3))
-            level = self.level(mean, field.mean(dim=(2, 3)))
+            scale = self.scale_branch(mean, field.mean(dim=(2, 3)))
             x = x - mean[..., None, None]
         x = self.tokens(self.drop(x))
         if self.class_tokens is not None:
@@ -133,16 +145,21 @@ class DepthHead(nn.Module):
         x = F.interpolate(self.narrow(x), scale_factor=2, mode="bilinear", align_corners=False)
         features = self.mix(F.gelu(x + self.guide(F.pixel_unshuffle(image, FACTOR))))
         out: Tensor = self.out(features)
-        if level is not None:
-            log_depth = out[:, :1] - out[:, :1].mean(dim=(2, 3), keepdim=True) + level[:, None, None, None]
+        if scale is not None:
+            log_depth = out[:, :1] - out[:, :1].mean(dim=(2, 3), keepdim=True) + scale[:, None, None, None]
             out = torch.cat([log_depth, out[:, 1:]], dim=1)
         return out, features
 
     def forward(
         self, tokens: Tensor, class_tokens: Tensor, image: Tensor, field: Tensor | None = None
     ) -> Tensor:
-        """Predict from ``tokens (B, taps, dim, H/14, W/14)``, ``class_tokens (B, taps, dim)``,
-        the ImageNet-normalised ``image (B, 3, H, W)`` and the gravity ``field (B, 4, H/7, W/7)``.
+        """The prediction at full resolution.
+
+        Args:
+            tokens: ``(B, taps, dim, H/14, W/14)``.
+            class_tokens: ``(B, taps, dim)``.
+            image: ``(B, 3, H, W)``, ImageNet-normalised.
+            field: gravity field ``(B, 4, H/7, W/7)``, 0 where gravity is unknown; None: unknown for all.
 
         Returns:
             ``(B, 2, H, W)``: natural logarithm of the canonical depth, and of its Laplace spread.
@@ -152,14 +169,15 @@ class DepthHead(nn.Module):
 
 
 class HeadEnsemble(nn.Module):
-    """Heads that learnt from different seeds or sources, averaged.
+    """Heads trained with different seeds or on different sources, averaged.
 
-    Sigma is their geometric mean, averaged with what a :class:`~slamdepth.depth.uncertainty.Doubt`
-    says where the shape has one. What they disagree on adds nothing: heads that know different things differ
-    most in the scale of a whole image, which says nothing of its pixels, and the order of pixels
-    by certainty got worse with it.
+    Sigma is the geometric mean of the members', averaged with the estimate of an
+    :class:`~slamdepth.depth.uncertainty.UncertaintyNet` where the shape has one. Disagreement between members
+    does not add to it: heads trained on different sources differ most in the scale of a whole image, which
+    says nothing of its pixels, and sigma ordered the pixels of an image worse with it.
 
     Args:
+        shape: of the network.
         sigma_scale: factor that makes sigma cover 68 % of the errors on held-out places.
     """
 
@@ -168,32 +186,57 @@ class HeadEnsemble(nn.Module):
         self.shape = shape
         self.sigma_scale = sigma_scale
         self.members = nn.ModuleList(DepthHead(shape) for _ in range(shape.members))
-        self.doubt: Doubt | None = Doubt(shape.token_dim, shape.doubt) if shape.doubt else None
+        self.uncertainty: UncertaintyNet | None = (
+            UncertaintyNet(shape.token_dim, shape.uncertainty_dim) if shape.uncertainty_dim else None
+        )
         width = len(shape.taps) * shape.token_dim
-        self.down: DownScorer | None = DownScorer(width, shape.down_dim) if shape.down_dim else None
+        self.gravity: GravityScorer | None = (
+            GravityScorer(width, shape.gravity_dim) if shape.gravity_dim else None
+        )
 
     def forward(
         self, tokens: Tensor, class_tokens: Tensor, image: Tensor, field: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Mean log depth and its calibrated standard deviation, each ``(B, H, W)``; see
-        :meth:`DepthHead.forward`."""
+        """The mean prediction at full resolution.
+
+        Args:
+            tokens: ``(B, taps, dim, H/14, W/14)``.
+            class_tokens: ``(B, taps, dim)``.
+            image: ``(B, 3, H, W)``, ImageNet-normalised.
+            field: gravity field ``(B, 4, H/7, W/7)``, 0 where gravity is unknown; None: unknown for all.
+
+        Returns:
+            Natural logarithm of the canonical depth and its calibrated standard deviation, both
+            ``(B, H, W)``.
+        """
         members = cast("list[DepthHead]", list(self.members))
-        told = [member.coarse(tokens, class_tokens, image, field) for member in members]
-        if self.doubt is not None:
-            log_depth, own = torch.stack([coarse for coarse, _ in told]).mean(dim=0).unbind(dim=1)
+        predicted = [member.coarse(tokens, class_tokens, image, field) for member in members]
+        if self.uncertainty is not None:
+            log_depth, own = torch.stack([coarse for coarse, _ in predicted]).mean(dim=0).unbind(dim=1)
             sine = torch.zeros_like(own) if field is None else field[:, 0]
-            doubt = self.doubt(tokens[:, -1], log_depth, own, sine)
-            told = [(torch.stack([coarse[:, 0], doubt], dim=1), features) for coarse, features in told]
+            log_spread = self.uncertainty(tokens[:, -1], log_depth, own, sine)
+            predicted = [
+                (torch.stack([coarse[:, 0], log_spread], dim=1), features) for coarse, features in predicted
+            ]
         outs = torch.stack([
             convex_upsample(coarse, member.weights(features))
-            for member, (coarse, features) in zip(members, told, strict=True)
+            for member, (coarse, features) in zip(members, predicted, strict=True)
         ])  # fmt: skip
         # A Laplace distribution of spread b has the variance 2 b^2.
         return outs[:, :, 0].mean(dim=0), self.sigma_scale * math.sqrt(2.0) * outs[:, :, 1].mean(dim=0).exp()
 
 
 def save_head(path: Path, model: HeadEnsemble, about: dict[str, str]) -> None:
-    """Write ``model`` in half precision, atomically, with ``about`` in the header."""
+    """Write ``model`` in half precision, atomically.
+
+    Args:
+        path: a safetensors file; missing folders are made.
+        model: the heads.
+        about: kept in the header next to the format and the shape, such as ``trained_on`` and ``licence``.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     from safetensors.torch import save
 
     tensors = {name: value.detach().half().contiguous() for name, value in model.state_dict().items()}
@@ -210,11 +253,14 @@ def save_head(path: Path, model: HeadEnsemble, about: dict[str, str]) -> None:
 
 
 def load_head(path: Path, device: str = "cpu") -> tuple[HeadEnsemble, dict[str, str]]:
-    """A head file, in eval mode, with its header.
+    """Read a head file.
+
+    Returns:
+        The heads, frozen and in eval mode, and the header.
 
     Raises:
-        WeightsError: the file is missing, of another format, or a tensor is missing,
-            extra or misshapen; names it.
+        WeightsError: the file is missing, of another or an earlier format, or a tensor is missing, extra or
+            misshapen; names it.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -226,19 +272,19 @@ def load_head(path: Path, device: str = "cpu") -> tuple[HeadEnsemble, dict[str, 
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file: {error}") from error
-    if (kind := meta.get("format")) not in (FORMAT, *_EARLIER):
-        raise WeightsError(f"{path}: not a depth head of this package (format {kind!r})")
+    if (kind := meta.get("format", "")) != FORMAT:
+        if kind.startswith(_FORMAT_NAME):
+            raise WeightsError(
+                f"{path}: a head of another version of slamdepth ({kind}, not {FORMAT}); train it again with "
+                "'slamdepth train-depth'"
+            )
+        raise WeightsError(f"{path}: not a depth head of this package (format {meta.get('format')!r})")
     try:
         values = json.loads(meta["shape"])
         shape = HeadShape(**{**values, "taps": tuple(values["taps"])})
         model = HeadEnsemble(shape, float(meta["sigma_scale"]))
     except (KeyError, TypeError, ValueError) as error:
         raise WeightsError(f"{path}: the header does not describe a depth head: {error}") from error
-    if kind != FORMAT and (shape.level_dim or shape.doubt):
-        raise WeightsError(
-            f"{path}: a head of an earlier version of slamdepth ({kind}), which told scale or uncertainty in "
-            f"another way; train it again with 'slamdepth train-depth'"
-        )
     check_layout(
         {name: tuple(value.shape) for name, value in tensors.items()},
         {name: tuple(value.shape) for name, value in model.state_dict().items()},

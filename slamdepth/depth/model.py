@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch.nn import functional as F
 
 from slamdepth.depth import weights as store
 from slamdepth.depth.card import ModelCard
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
-from slamdepth.depth.gravity_direction import FRAMES, DownEstimate, Look, find_down
+from slamdepth.depth.gravity_direction import FRAMES, EncodedImage, GravityEstimate, estimate_gravity
 from slamdepth.depth.gravity_field import gravity_field
 from slamdepth.depth.head import HeadEnsemble, load_head
 from slamdepth.depth.preprocess import (
@@ -28,53 +27,66 @@ from slamdepth.depth.preprocess import (
     resize_rgb,
 )
 from slamdepth.depth.registry import register
-from slamdepth.depth.upright import roll_rad, turned, turned_back
+from slamdepth.depth.upright import roll_rad, rotated, rotated_back
 from slamdepth.depth.vanishing import find_lines, manhattan_frames
 from slamdepth.io import sha256_of
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
+from slamdepth.typing import Floats
 
-_TURN_RAD = math.radians(8.0)
-"""A look at an image turned by so much less or more serves to find out which way is down."""
+_SAME_ROLL_RAD = math.radians(8.0)
+"""To score directions of gravity, an image rotated by so much less or more than asked for serves as well."""
 
-_LEVEL_RAD, _ROLLED_RAD = math.radians(4.0), math.radians(12.0)
-"""An image rolled by less counts as it was taken, one rolled by more as it is turned upright; between them
-the one goes over into the other, so that the depth of a video does not jump."""
+_UPRIGHT_RAD, _ROLLED_RAD = math.radians(4.0), math.radians(12.0)
+"""An image rolled by less than the first is predicted as taken, one rolled by more than the second as rotated
+upright. Between them the two predictions are blended, so that the depth of a video does not jump."""
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """What the backbone says of an image: a look at it, and what else the head reads."""
+class _Encoded:
+    """All that the head reads of an image.
 
-    look: Look
+    Attributes:
+        image: tokens, input size and focal length.
+        class_tokens: ``(1, taps, dim)``.
+        pixels: ``(1, 3, rows, columns)``, ImageNet-normalised.
+        frame: the image at its own size, and its camera.
+    """
+
+    image: EncodedImage
     class_tokens: torch.Tensor
-    image: torch.Tensor
+    pixels: torch.Tensor
     frame: Frame
 
 
-class _Looks:
-    """A frame as taken and turned upright from rolls, each seen once."""
+class _Rotations:
+    """A frame as taken and rotated upright from several rolls; each rotation is encoded once.
 
-    def __init__(self, frame: Frame, see: Callable[[Frame, float], _Seen]) -> None:
-        self._see, self.as_taken = see, see(frame, 0.0)
-        self._seen = [self.as_taken]
+    Args:
+        frame: as taken.
+        encode: runs the backbone on a frame; the roll in radians that was undone is passed on.
+    """
 
-    def at(self, roll: float, within_rad: float = _TURN_RAD) -> _Seen:
-        """A look in which a camera of this roll is upright to ``within_rad``."""
-        for seen in self._seen:
-            apart = roll - seen.look.turn_rad
+    def __init__(self, frame: Frame, encode: Callable[[Frame, float], _Encoded]) -> None:
+        self._encode, self.as_taken = encode, encode(frame, 0.0)
+        self._encoded = [self.as_taken]
+
+    def upright_from(self, roll: float, within_rad: float = _SAME_ROLL_RAD) -> _Encoded:
+        """The image in which a camera of this ``roll``, in radians, is upright to ``within_rad``."""
+        for encoded in self._encoded:
+            apart = roll - encoded.image.roll_rad
             if abs(math.atan2(math.sin(apart), math.cos(apart))) < within_rad:
-                return seen
+                return encoded
         frame = self.as_taken.frame
-        image = turned(frame.image_rgb, frame.camera, -roll)
-        self._seen.append(self._see(replace(frame, image_rgb=image, depth_m=None), roll))
-        return self._seen[-1]
+        image = rotated(frame.image_rgb, frame.camera, -roll)
+        self._encoded.append(self._encode(replace(frame, image_rgb=image, depth_m=None), roll))
+        return self._encoded[-1]
 
 
 class Dinov2Depth:
     """DINOv2 tokens and a small trained head; see ``slamdepth/assets/dinov2_head.md``.
 
-    A head that is told where down is finds it by lines and tokens first; an image that is rolled is then
-    turned upright and seen once more.
+    Where the head reads gravity, its direction is estimated first, from lines and tokens, unless the frame
+    has it. An image that is rolled is then rotated upright and encoded once more.
 
     Args:
         backbone: a ViT-S/14 in eval mode.
@@ -125,64 +137,68 @@ class Dinov2Depth:
         return cls(load_dinov2(backbone_file, device), network, infos, device)
 
     def predict(self, frame: Frame) -> DepthPrediction:
-        """Depth in metres for every raw (not undistorted) pixel of ``frame``; gravity is found out where the
-        frame does not say it.
+        """Depth in metres for every raw (not undistorted) pixel of ``frame``.
+
+        Gravity is estimated where the frame does not have it.
 
         Raises:
             CameraError: the image is too small or too narrow for the network.
         """
         check_size(frame)
-        looks = _Looks(frame, self._see)
+        rotations = _Rotations(frame, self._encode)
         if frame.gravity is not None:
-            return replace(self._upright(looks, frame.gravity), gravity=frame.gravity, gravity_share=1.0)
-        if (down := self._down(frame, looks)) is None:
-            return self._upright(looks, None)
-        return replace(self._upright(looks, down.down), gravity=down.down, gravity_share=down.share)
+            return replace(self._upright(rotations, frame.gravity), gravity=frame.gravity, gravity_share=1.0)
+        if (found := self._gravity(frame, rotations)) is None:
+            return self._upright(rotations, None)
+        return replace(
+            self._upright(rotations, found.gravity), gravity=found.gravity, gravity_share=found.share
+        )
 
-    def _see(self, frame: Frame, turn_rad: float) -> _Seen:
+    def _encode(self, frame: Frame, roll: float) -> _Encoded:
         height, width = frame.image_rgb.shape[:2]
         rows, columns = input_size(height, width, self._head.shape.input_px)
-        image = normalised(resize_rgb(frame.image_rgb, rows, columns)[None], self.device)
+        pixels = normalised(resize_rgb(frame.image_rgb, rows, columns)[None], self.device)
         with torch.inference_mode():
-            tapped = self._backbone(image.to(self._dtype), self._head.shape.taps)
+            tapped = self._backbone(pixels.to(self._dtype), self._head.shape.taps)
             tokens = torch.stack([grid for grid, _ in tapped], dim=1).float()
             class_tokens = torch.stack([token for _, token in tapped], dim=1).float()
         focal_px = focal_px_at(frame.camera, rows, columns)
-        return _Seen(Look(tokens, (rows, columns), focal_px, turn_rad), class_tokens, image, frame)
+        image = EncodedImage(tokens, (rows, columns), focal_px, roll)
+        return _Encoded(image, class_tokens, pixels, frame)
 
-    def _down(self, frame: Frame, looks: _Looks) -> DownEstimate | None:
-        if self._head.down is None:
+    def _gravity(self, frame: Frame, rotations: _Rotations) -> GravityEstimate | None:
+        if self._head.gravity is None:
             return None
         frames = manhattan_frames(find_lines(frame.image_rgb, frame.camera), FRAMES)
-        return find_down(self._head.down, frames, lambda roll: looks.at(roll).look)
+        return estimate_gravity(self._head.gravity, frames, lambda roll: rotations.upright_from(roll).image)
 
-    def _upright(self, looks: _Looks, down: NDArray[np.float64] | None) -> DepthPrediction:
-        """The prediction of the look in which the camera is upright, given ``down (3,)`` as taken."""
-        as_taken = self._told(looks.as_taken, down)
-        if down is None:
+    def _upright(self, rotations: _Rotations, gravity: Floats | None) -> DepthPrediction:
+        """The prediction of the rotation in which the camera is upright; ``gravity (3,)`` is as taken."""
+        as_taken = self._predict(rotations.as_taken, gravity)
+        if gravity is None:
             return as_taken
-        roll = roll_rad(down)
-        if (upright := looks.at(roll, _LEVEL_RAD)) is looks.as_taken:
+        roll = roll_rad(gravity)
+        if (upright := rotations.upright_from(roll, _UPRIGHT_RAD)) is rotations.as_taken:
             return as_taken
-        told = self._told(upright, upright.look.seen(down))
-        share = min(1.0, (abs(roll) - _LEVEL_RAD) / (_ROLLED_RAD - _LEVEL_RAD))
-        return turned_back(told, as_taken, upright.frame.camera, upright.look.turn_rad, share)
+        prediction = self._predict(upright, upright.image.rotated(gravity))
+        share = min(1.0, (abs(roll) - _UPRIGHT_RAD) / (_ROLLED_RAD - _UPRIGHT_RAD))
+        return rotated_back(prediction, as_taken, upright.frame.camera, upright.image.roll_rad, share)
 
-    def _told(self, seen: _Seen, down: NDArray[np.float64] | None) -> DepthPrediction:
-        """The head's prediction, told that gravity points ``down (3,)`` in what was seen."""
-        look = seen.look
+    def _predict(self, encoded: _Encoded, gravity: Floats | None) -> DepthPrediction:
+        """The head's prediction; ``gravity (3,)`` is in the frame of the encoded image."""
+        image = encoded.image
         with torch.inference_mode():
             field = None
-            if down is not None:
-                direction = torch.from_numpy(down[None]).float().to(self.device)
+            if gravity is not None:
+                direction = torch.from_numpy(gravity[None]).float().to(self.device)
                 field = gravity_field(
-                    direction, torch.tensor([look.focal_px], device=self.device), *look.size
+                    direction, torch.tensor([image.focal_px], device=self.device), *image.size
                 )
-            log_depth, sigma = self._head(look.tokens, seen.class_tokens, seen.image, field)
+            log_depth, sigma = self._head(image.tokens, encoded.class_tokens, encoded.pixels, field)
             both = torch.stack([log_depth, sigma], dim=1)
-            size = seen.frame.image_rgb.shape[:2]
+            size = encoded.frame.image_rgb.shape[:2]
             full = F.interpolate(both, size=size, mode="bilinear", align_corners=False)[0]
-            log_depth_full = full[0] + math.log(look.focal_px / CANONICAL_FOCAL_PX)
+            log_depth_full = full[0] + math.log(image.focal_px / CANONICAL_FOCAL_PX)
             values = log_depth_full.exp().cpu().numpy()
             sigma_log = full[1].cpu().numpy()
         return DepthPrediction(
@@ -193,7 +209,7 @@ class Dinov2Depth:
 
 
 def _card(head: HeadEnsemble, weights: tuple[WeightsInfo, ...]) -> ModelCard:
-    """What the head learnt from; its training images are brought to one focal length."""
+    """The card of a head; its training images were brought to one focal length."""
     about = weights[-1] if weights else WeightsInfo("none", "", "unknown", "unknown")
     size = input_size(3, 4, head.shape.input_px)
     return ModelCard("dinov2", DepthKind.METRIC, size, CANONICAL_FOCAL_PX, about.licence, about.trained_on)
@@ -203,7 +219,7 @@ def _card(head: HeadEnsemble, weights: tuple[WeightsInfo, ...]) -> ModelCard:
 def create(*, device: str = "cpu", seed: int = 0, weights: Path | None = None) -> Dinov2Depth:
     """The model with the cached backbone and the head in ``weights``, by default the shipped one.
 
-    It has nothing random.
+    Nothing in it is random: ``seed`` has no effect.
     """
     del seed
     return Dinov2Depth.load(head=weights, device=device)

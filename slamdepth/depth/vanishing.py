@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directions that an image's straight lines run along in space: three at right angles.
+"""Manhattan frames of an image: three orthogonal directions in space that its straight lines run along.
 
 Lines that are parallel in space meet in a vanishing point, and the ray through it is their direction.
-Rooms and furniture are mostly made of three such directions at right angles (Coughlan and Yuille,
-"Manhattan World", ICCV 1999), one of which is vertical. Frames of three are drawn from random lines,
-two for a direction and one for another (after Zhang et al., "Vanishing point estimation and line
-classification in a Manhattan world", ACCV 2012), and those most lines agree with are kept.
+Buildings and furniture mostly have three such directions at right angles (Coughlan and Yuille, "Manhattan
+World", ICCV 1999), one of which is vertical. Frames are sampled from random lines, two for the first
+direction and one for the second (after Zhang et al., "Vanishing point estimation and line classification in
+a Manhattan world", ACCV 2012), and the frames with most inlier lines are kept.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
 _WIDTH_PX = 340
-"""Lines are looked for in an image of about this width: finer ones are texture."""
+"""Lines are detected in an image of about this width: finer ones are texture."""
 _SHORTEST = 0.04  # of the image's width
-_LONGEST = 0.3  # longer ones count no more; tangents of angles
+_LONGEST = 0.3  # longer ones weigh no more; tangents of angles
 _FEWEST_LINES = 8
 _TRIALS = 1000
 _WITHIN_RAD = np.radians(2.0)
@@ -35,12 +35,12 @@ _UPRIGHT_RAD = np.radians(45.0)
 
 @dataclass(frozen=True)
 class Lines:
-    """Straight lines of an image.
+    """Straight lines of an image, in the camera's frame.
 
     Attributes:
         normals: ``(N, 3)`` unit normals of the planes through the camera and each line.
-        middles: ``(N, 3)`` unit rays through their middles.
-        weights: ``(N,)`` by length.
+        middles: ``(N, 3)`` unit rays through the middle of each line.
+        weights: ``(N,)``, which grow with length.
     """
 
     normals: Floats
@@ -53,10 +53,10 @@ class Lines:
 
 @dataclass(frozen=True)
 class ManhattanFrame:
-    """Three directions at right angles.
+    """Three orthogonal directions.
 
     Attributes:
-        axes: ``(3, 3)``, one unit direction of the camera's frame a row; either sense may be meant.
+        axes: ``(3, 3)``, one unit vector of the camera's frame per row; its sense is arbitrary.
         support: ``(3,)``, the share of all lines' weight that runs along each.
     """
 
@@ -65,7 +65,7 @@ class ManhattanFrame:
 
 
 def find_lines(image_rgb: NDArray[np.uint8], camera: Camera) -> Lines:
-    """Straight lines of a raw image ``(H, W, 3)`` by LSD (von Gioi et al. 2010); distortion is undone."""
+    """Straight lines of a raw image ``(H, W, 3)`` by LSD (von Gioi et al. 2010), undistorted."""
     scale = min(1.0, _WIDTH_PX / image_rgb.shape[1])
     grey = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
     if scale < 1.0:
@@ -91,14 +91,14 @@ def find_lines(image_rgb: NDArray[np.uint8], camera: Camera) -> Lines:
 
 
 def manhattan_frames(lines: Lines, count: int = 1) -> list[ManhattanFrame]:
-    """At most ``count`` frames that differ, those most lines run along first; the same for the same lines.
+    """Manhattan frames of ``lines``, at most ``count`` different ones, the one with most inliers first.
 
-    Empty where there are too few lines to tell.
+    The result depends on the lines alone: the random numbers are seeded. It is empty with fewer than 8 lines.
     """
     if len(lines) < _FEWEST_LINES:
         return []
     rng = np.random.default_rng(0)
-    axes = _drawn(lines, rng)
+    axes = _sampled(lines, rng)
     order = np.argsort(-_agreement(axes, lines)[0], kind="stable")
     chosen: list[Floats] = []
     for k in order:
@@ -119,23 +119,32 @@ def manhattan_frames(lines: Lines, count: int = 1) -> list[ManhattanFrame]:
     return frames
 
 
-def held_upright_down(image_rgb: NDArray[np.uint8], camera: Camera) -> Floats | None:
-    """Direction of gravity ``(3,)`` in the camera's frame, of an image that was held roughly upright.
+def gravity_if_upright(image_rgb: NDArray[np.uint8], camera: Camera) -> Floats | None:
+    """Direction of gravity in an image of a camera that was held roughly upright.
 
-    None where the lines do not tell, or none of their directions is within 45 degrees of the image's own
-    vertical.
+    Args:
+        image_rgb: ``(H, W, 3)``, raw.
+        camera: that took it.
+
+    Returns:
+        ``(3,)`` unit vector in the camera's frame (x right, y down, z forward). None where there are too few
+        lines, or none of their directions is within 45 degrees of the image's vertical axis.
     """
     frames = manhattan_frames(find_lines(image_rgb, camera))
     if not frames:
         return None
     axes = frames[0].axes
-    down = axes[np.abs(axes[:, 1]).argmax()]
-    down = down * np.sign(down[1])
-    return down if abs(np.arctan2(down[0], down[1])) < _UPRIGHT_RAD else None
+    vertical = axes[np.abs(axes[:, 1]).argmax()]
+    gravity = vertical * np.sign(vertical[1])
+    return gravity if abs(np.arctan2(gravity[0], gravity[1])) < _UPRIGHT_RAD else None
 
 
-def _drawn(lines: Lines, rng: np.random.Generator) -> Floats:
-    """Random frames ``(N, 3, 3)``: where two lines meet, what a third says at right angles, and the rest."""
+def _sampled(lines: Lines, rng: np.random.Generator) -> Floats:
+    """Random frames ``(N, 3, 3)``.
+
+    The first axis is the direction of two lines, the second the orthogonal direction of a third line, and the
+    third their cross product.
+    """
     share = lines.weights / lines.weights.sum()
     i, j, k = (lines.normals[rng.choice(len(lines), _TRIALS, p=share)] for _ in range(3))
     first = np.cross(i, j)
@@ -148,10 +157,9 @@ def _drawn(lines: Lines, rng: np.random.Generator) -> Floats:
 
 
 def _agreement(axes: Floats, lines: Lines) -> tuple[Floats, Floats]:
-    """Line weight that agrees with each frame ``(N,)``; how much each line does with each axis, 0 to 1.
+    """Inlier weight of each frame ``(N,)``, and ``(N, 3, lines)`` how well each line fits each axis, 0 to 1.
 
-    Most of the time goes here, so it is in single precision: that moves a direction by far less than lines
-    tell it to.
+    Most of the time goes here, so it is in single precision: the error is far below that of the lines.
     """
     flat, normals, middles = (
         each.astype(np.float32) for each in (axes.reshape(-1, 3), lines.normals, lines.middles)
@@ -163,5 +171,5 @@ def _agreement(axes: Floats, lines: Lines) -> tuple[Floats, Floats]:
 
 
 def _differ(axes: Floats, other: Floats) -> bool:
-    """True where some axis of one frame is along none of the other."""
+    """True where some axis of one frame is not within 8 degrees of any axis of the other."""
     return bool(np.abs(axes @ other.T).max(axis=1).min() < np.cos(_SAME_RAD))

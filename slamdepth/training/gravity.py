@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from slamdepth.depth.vanishing import held_upright_down
+from slamdepth.depth.vanishing import gravity_if_upright
 from slamdepth.training.data import Place
 from slamdepth.types import Frame
 
@@ -34,7 +34,7 @@ def down_of(place: Place, index: int, frame: Frame | None = None) -> NDArray[np.
         frame = place.read(index) if frame is None else frame
         while len(_found) >= _MOST_REMEMBERED:
             del _found[next(iter(_found))]
-        _found[key] = held_upright_down(frame.image_rgb, frame.camera)
+        _found[key] = gravity_if_upright(frame.image_rgb, frame.camera)
     return _found[key]
 
 

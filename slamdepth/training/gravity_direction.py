@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from slamdepth.depth.gravity_direction import DownScorer, token_fields
+from slamdepth.depth.gravity_direction import GravityScorer, token_fields
 from slamdepth.depth.head import HeadShape
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
 from slamdepth.errors import ConfigError
@@ -48,7 +48,7 @@ def offered_directions(down: Floats, rng: np.random.Generator) -> Floats:
 
 def learn_down(
     caches: Sequence[FeatureCache], shape: HeadShape, seed: int, device: str, progress: Progress
-) -> DownScorer:
+) -> GravityScorer:
     """A scorer that tells gravity from other directions in the views of ``caches``.
 
     Raises:
@@ -77,13 +77,13 @@ def learn_down(
     return scorer.eval()
 
 
-def new_scorer(shape: HeadShape, device: str) -> DownScorer:
+def new_scorer(shape: HeadShape, device: str) -> GravityScorer:
     """One that has learnt nothing."""
-    return DownScorer(len(shape.taps) * shape.token_dim, shape.down_dim, _DROPOUT).to(device).train()
+    return GravityScorer(len(shape.taps) * shape.token_dim, shape.gravity_dim, _DROPOUT).to(device).train()
 
 
 def loss_of(
-    scorer: DownScorer,
+    scorer: GravityScorer,
     caches: Sequence[FeatureCache],
     chosen: NDArray[np.int64],
     rng: np.random.Generator,

@@ -105,7 +105,7 @@ def train_depth(
     check_known_depth(config, planned, caches, folds)
     judging = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None]
     dim = encoder.backbone.dim
-    shape = head_shape(config, dim, doubt=min(COMPONENTS, dim) if folds else 0)
+    shape = head_shape(config, dim, uncertainty_dim=min(COMPONENTS, dim) if folds else 0)
     key = digest(config, FORMAT, [plan.folder.name for plan in planned])
     ensemble = HeadEnsemble(shape)
     history: list[EpochFigures] = []
@@ -115,9 +115,9 @@ def train_depth(
         head, epochs = _train_member(config, training, views, judging, shape, member, key, device, progress)
         ensemble.members[member].load_state_dict(head.state_dict())
         history += epochs
-    if ensemble.down is not None:
+    if ensemble.gravity is not None:
         scorer = learn_down(of_gravity(planned, caches), shape, config.seed, device, progress)
-        ensemble.down.load_state_dict(scorer.state_dict())
+        ensemble.gravity.load_state_dict(scorer.state_dict())
     unseen: dict[str, dict[str, float]] = {}
     ensemble.sigma_scale = config.sigma_scale
     if folds:
@@ -129,8 +129,8 @@ def train_depth(
         doubt, ensemble.sigma_scale, unseen = learn_doubt(
             planned, caches, folds, of_fold, seed=config.seed, device=device, progress=progress
         )
-        assert ensemble.doubt is not None
-        ensemble.doubt.load_state_dict(doubt.state_dict())
+        assert ensemble.uncertainty is not None
+        ensemble.uncertainty.load_state_dict(doubt.state_dict())
     ensemble.eval().to(device)
 
     held_out, ratios = {}, []
@@ -164,7 +164,7 @@ def train_depth(
     return result
 
 
-def head_shape(config: TrainConfig, token_dim: int, *, doubt: int = 0) -> HeadShape:
+def head_shape(config: TrainConfig, token_dim: int, *, uncertainty_dim: int = 0) -> HeadShape:
     """The heads that ``config`` asks for, on tokens of ``token_dim`` channels."""
     return HeadShape(
         config.head.taps,
@@ -173,11 +173,11 @@ def head_shape(config: TrainConfig, token_dim: int, *, doubt: int = 0) -> HeadSh
         config.head.blocks,
         config.head.guide_dim,
         members=config.members,
-        doubt=doubt,
-        level_dim=config.head.level_dim,
+        uncertainty_dim=uncertainty_dim,
+        scale_dim=config.head.level_dim,
         input_px=config.view.rows * config.view.columns,
         gravity=config.head.gravity,
-        down_dim=config.head.down_dim,
+        gravity_dim=config.head.down_dim,
     )
 
 

@@ -3,7 +3,7 @@
 
 Every place is left out once, a third of them at a time: a head learns from the others, predicts views of
 those left out that are not mixed, and what it gets wrong there, after the view's median is taken out, is
-what a :class:`~slamdepth.depth.uncertainty.Doubt` learns to foresee.
+what a :class:`~slamdepth.depth.uncertainty.UncertaintyNet` learns to foresee.
 How wrong a whole view is is divided out,
 so that it learns which pixels of a view are surer than others. (What was mixed into a view that a head
 learns from may be of a place left out.)
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from slamdepth.depth.head import DepthHead
-from slamdepth.depth.uncertainty import Doubt, features, together
+from slamdepth.depth.uncertainty import UncertaintyNet, features, mean_log_spread
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.training.caches import PlannedCache
 from slamdepth.training.features import FeatureCache, load_batch
@@ -156,7 +156,7 @@ def join(parts: Sequence[Errors]) -> Errors:
 
 def fit_doubt(
     errors: Errors, seed: int, told: Callable[[int], None] = lambda _: None, *, steps: int | None = None
-) -> Doubt:
+) -> UncertaintyNet:
     """Learn log spread by Laplace likelihood (Kendall and Gal 2017) of the errors' shares in a
     view's mean error, times the mean of all. Each place counts the same.
 
@@ -167,7 +167,7 @@ def fit_doubt(
     steps = _STEPS if steps is None else steps
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        doubt = Doubt(errors.tokens.shape[1], min(COMPONENTS, errors.tokens.shape[1]))
+        doubt = UncertaintyNet(errors.tokens.shape[1], min(COMPONENTS, errors.tokens.shape[1]))
         tokens = errors.tokens.float()
         doubt.centre.copy_(tokens.mean(dim=0))
         variance, axes = torch.linalg.eigh(torch.cov(tokens.T))
@@ -183,7 +183,7 @@ def fit_doubt(
             for group in optimiser.param_groups:
                 group["lr"] = _RATE * (1 - step / steps)
             some = torch.cat([of[torch.randint(len(of), (_BATCH // len(places),))] for of in places])
-            spread = doubt.judge(read[some])
+            spread = doubt.log_spread(read[some])
             loss = (target[some] * (-spread).exp() + spread).mean()
             optimiser.zero_grad()
             loss.backward()
@@ -192,18 +192,18 @@ def fit_doubt(
     return doubt.eval().requires_grad_(False)
 
 
-def read_by(doubt: Doubt, errors: Errors) -> Tensor:
+def read_by(doubt: UncertaintyNet, errors: Errors) -> Tensor:
     """What ``doubt`` reads of each pixel, ``(N, components + FEATURES)``."""
     seen = (errors.tokens.float() - doubt.centre) @ doubt.basis.T
-    return torch.cat([seen, doubt.scaled(errors.features)], dim=1)
+    return torch.cat([seen, doubt.standardised(errors.features)], dim=1)
 
 
-def spread_of(doubt: Doubt, errors: Errors) -> Tensor:
+def spread_of(doubt: UncertaintyNet, errors: Errors) -> Tensor:
     """Log spread ``(N,)`` that a head with ``doubt`` tells of each pixel."""
-    return together(errors.own, doubt.judge(read_by(doubt, errors)))
+    return mean_log_spread(errors.own, doubt.log_spread(read_by(doubt, errors)))
 
 
-def sigma_scale(doubt: Doubt, errors: Errors) -> float:
+def sigma_scale(doubt: UncertaintyNet, errors: Errors) -> float:
     """The factor that makes sigma cover 68 % of the errors after the view's median: the mean over
     places, each of which counts the same."""
     ratio = errors.error / (math.sqrt(2.0) * spread_of(doubt, errors).exp())
@@ -239,7 +239,7 @@ def learn_doubt(
     seed: int,
     device: str,
     progress: Progress,
-) -> tuple[Doubt, float, dict[str, dict[str, float]]]:
+) -> tuple[UncertaintyNet, float, dict[str, dict[str, float]]]:
     """The whole way: heads without some places each, their errors there, the doubt learnt from all.
 
     Args:
