@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tensor names and shapes of published depth checkpoints, written down from their listings,
-not from our networks; and random files in them."""
+"""Tensor names and shapes of published depth checkpoints, and files of random tensors in these layouts.
+
+The layouts are copied from listings of the published files, not derived from our networks.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A CUDA device where there is none: shapes and devices are followed, nothing is computed.
+"""A pretended CUDA device: shapes and devices are tracked, nothing is computed.
 
-What is moved to ``"cuda"`` becomes a tensor of PyTorch's device ``meta``; what comes back to the CPU is
-all ones. An operation that reads tensors of both devices raises :class:`MixedDevicesError`, as on a GPU.
+A tensor moved to ``"cuda"`` becomes one of PyTorch's device ``meta``; moved back to the CPU it is all ones.
+An operation that reads tensors of both devices raises :class:`MixedDevicesError`, as on a GPU.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _SCALARS: dict[str, Any] = {"item": 1.0, "__float__": 1.0, "__int__": 1000, "__b
 
 
 class MixedDevicesError(RuntimeError):
-    """Tensors of the CPU and of the pretended GPU were read by one operation."""
+    """One operation read tensors of the CPU and of the pretended GPU."""
 
 
 @contextmanager
 def pretend_cuda(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """``"cuda"`` is there while this lasts."""
+    """The device ``"cuda"`` is available inside the context."""
     with monkeypatch.context() as patch:
         patch.setattr(torch.cuda, "is_available", lambda: True)
         patch.setattr(nn.Module, "to", _module_to)
@@ -52,7 +52,7 @@ class _Pretending(TorchFunctionMode):
                 if func is torch.Tensor.cpu:
                     return torch.ones(first.shape, dtype=first.dtype)
                 if name in ("numpy", "__array__"):
-                    raise TypeError("a CUDA tensor is not to be had as a NumPy array")
+                    raise TypeError("a CUDA tensor cannot be converted to a NumPy array")
                 if name in _SCALARS:
                     return _SCALARS[name]
         tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
@@ -97,7 +97,7 @@ def _there(tensor: Tensor, dtype: torch.dtype | None) -> Tensor:
 
 
 def _module_to(module: nn.Module, *args: Any, **kwargs: Any) -> nn.Module:
-    """``Module.to``, which gives its parameters new data in place: that cannot change their device here."""
+    """``Module.to`` with new parameters: new data in the old ones, as PyTorch does, cannot be on ``meta``."""
     device, dtype = _asked(args, kwargs)
     for part in module.modules():
         for name, value in part._parameters.items():
@@ -112,6 +112,6 @@ def _module_to(module: nn.Module, *args: Any, **kwargs: Any) -> nn.Module:
 
 
 def _load_state_dict(module: nn.Module, state: dict[str, Tensor], *_: Any, **__: Any) -> None:
-    """Names and shapes are compared; data there is none."""
+    """Compare names and shapes; there is no data to load."""
     own = {name: tuple(value.shape) for name, value in module.state_dict().items()}
     assert own == {name: tuple(value.shape) for name, value in state.items()}

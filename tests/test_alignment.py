@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From predictions to metres of the map."""
+"""Depth predictions fitted to landmarks: correction, uncertainty and dense depth in metres of the map."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def prediction(values: np.ndarray | None = None, sigma: float | None = 0.2) -> D
     return DepthPrediction(values, DepthKind.METRIC, sigma_log)
 
 
-def test_without_anchors_the_prior_is_left() -> None:
+def test_without_landmarks_the_prior_remains() -> None:
     px = grid()
     nothing = np.zeros(0)
     field = fit_depth_field(
@@ -72,7 +72,7 @@ def test_a_common_factor_is_found_everywhere(offset: float) -> None:
     )
 
 
-def test_a_smooth_bias_is_followed_and_doubt_shrinks_near_anchors() -> None:
+def test_a_smooth_bias_is_corrected_and_uncertainty_shrinks_near_landmarks() -> None:
     def bias(px: np.ndarray) -> np.ndarray:
         return 0.15 * np.sin(px[:, 0] / 80.0)
 
@@ -83,17 +83,17 @@ def test_a_smooth_bias_is_followed_and_doubt_shrinks_near_anchors() -> None:
         left, plane(left), sigma, plane(left) + bias(left), np.full(len(left), 0.01), width=WIDTH
     )
     near, far = np.array([[80.0, 120.0]]), np.array([[310.0, 120.0]])
-    correction, doubt = field.correction(near, plane(near), np.array([0.3]))
+    correction, sigma_near = field.correction(near, plane(near), np.array([0.3]))
     assert correction[0] == pytest.approx(bias(near)[0], abs=0.03)
-    _, doubt_far = field.correction(far, plane(far), np.array([0.3]))
-    assert doubt[0] < 0.6 * doubt_far[0]
-    assert doubt_far[0] > 0.8 * 0.3
-    assert doubt[0] >= np.sqrt(FieldSettings().white_share) * 0.3 - 1e-9  # nobody's neighbour tells that
-    assert doubt_far[0] < np.hypot(0.3, FieldSettings().common_sigma)
+    _, sigma_far = field.correction(far, plane(far), np.array([0.3]))
+    assert sigma_near[0] < 0.6 * sigma_far[0]
+    assert sigma_far[0] > 0.8 * 0.3
+    assert sigma_near[0] >= np.sqrt(FieldSettings().white_share) * 0.3 - 1e-9  # independent of neighbours
+    assert sigma_far[0] < np.hypot(0.3, FieldSettings().common_sigma)
 
 
-def test_anchors_on_another_surface_say_little() -> None:
-    """A wall behind a chair: same pixels, other depth, own error."""
+def test_landmarks_on_another_surface_have_little_influence() -> None:
+    """A wall behind a chair: the same pixels, another depth, an error of its own."""
     px = np.tile([[160.0, 120.0]], (6, 1)) + np.arange(6)[:, None]
     settings = FieldSettings(common_sigma=0.01)
     field = fit_depth_field(
@@ -101,29 +101,29 @@ def test_anchors_on_another_surface_say_little() -> None:
         width=WIDTH, settings=settings,
     )  # fmt: skip
     at = np.array([[162.0, 122.0]])
-    chair, chair_doubt = field.correction(at, np.log([1.0]), np.array([0.3]))
-    wall, wall_doubt = field.correction(at, np.log([4.0]), np.array([0.3]))
+    chair, chair_sigma = field.correction(at, np.log([1.0]), np.array([0.3]))
+    wall, wall_sigma = field.correction(at, np.log([4.0]), np.array([0.3]))
     assert chair[0] > 0.7 * np.log(1.2)
     assert abs(wall[0]) < 0.02
-    assert wall_doubt[0] > 0.95 * 0.3 > chair_doubt[0]
+    assert wall_sigma[0] > 0.95 * 0.3 > chair_sigma[0]
 
 
-def test_wrong_and_unknown_anchors_are_left_out() -> None:
+def test_outliers_and_unknown_landmarks_are_left_out() -> None:
     px = grid(40)
     truth = plane(px) + 0.1
     truth[::10] += 2.0
     predicted = plane(px)
     predicted[1] = np.nan
-    doubt = np.full(len(px), 0.01)
-    doubt[2] = np.nan
-    field = fit_depth_field(px, predicted, np.full(len(px), 0.2), truth, doubt, width=WIDTH)
+    sigma_map = np.full(len(px), 0.01)
+    sigma_map[2] = np.nan
+    field = fit_depth_field(px, predicted, np.full(len(px), 0.2), truth, sigma_map, width=WIDTH)
     assert field.anchors == len(px) - len(truth[::10]) - 2
     correction, after = field.correction(grid(9), plane(grid(9)), np.full(len(grid(9)), 0.2))
     np.testing.assert_allclose(correction, 0.1, atol=0.02)
     assert np.isfinite(after).all()
 
 
-def test_many_anchors_are_thinned() -> None:
+def test_many_landmarks_are_thinned() -> None:
     rng = np.random.default_rng(0)
     px = rng.uniform((0, 0), (WIDTH, HEIGHT), (2500, 2))
     field = fit_depth_field(
@@ -183,12 +183,12 @@ def test_the_corrected_depth_is_the_field_at_every_pixel() -> None:
     px = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
     log, sigma = prior_log_depth_at(metric, px)
     expected = np.exp(log + field.mean(px, log, sigma))
-    inside = (px < [WIDTH - 8, HEIGHT - 8]).all(axis=1)  # beyond the last node it is held
+    inside = (px < [WIDTH - 8, HEIGHT - 8]).all(axis=1)  # constant beyond the last grid point
     np.testing.assert_allclose(dense[v, u].ravel()[inside], expected[inside], rtol=2e-3)
     np.testing.assert_allclose(dense[v, u].ravel(), expected, rtol=0.02)
 
 
-def test_the_corrected_depth_keeps_the_unknown_unknown() -> None:
+def test_unknown_depth_stays_unknown_when_corrected() -> None:
     metric = prediction()
     metric.values[50:60, 100:140] = 0.0
     metric.values[0, 0] = np.nan
@@ -200,7 +200,7 @@ def test_the_corrected_depth_keeps_the_unknown_unknown() -> None:
     assert (dense_depth(fitted(), prediction(np.zeros((HEIGHT, WIDTH)))) == 0).all()
 
 
-def test_an_unknown_doubt_spoils_no_neighbours() -> None:
+def test_an_unknown_uncertainty_does_not_affect_neighbours() -> None:
     metric = prediction()
     assert metric.sigma_log is not None
     metric.sigma_log[16, 16] = np.nan
@@ -208,7 +208,7 @@ def test_an_unknown_doubt_spoils_no_neighbours() -> None:
     assert (dense > 0).sum() >= WIDTH * HEIGHT - 1
 
 
-def test_the_corrected_depth_without_anchors_is_the_prior() -> None:
+def test_the_corrected_depth_without_landmarks_is_the_prior() -> None:
     nothing = np.zeros(0)
     field = fit_depth_field(np.zeros((0, 2)), nothing, nothing, nothing, nothing, width=WIDTH)
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
@@ -219,16 +219,16 @@ def test_the_corrected_depth_without_anchors_is_the_prior() -> None:
     np.testing.assert_allclose(dense_depth(field, sure), sure.values, rtol=1e-4)
 
 
-def test_the_prior_shrinks_what_is_unsure_towards_the_middle() -> None:
+def test_the_prior_shrinks_uncertain_depth_towards_the_median() -> None:
     px = grid(40)
     middle = np.median(plane(grid(2)))
     sure, sure_sigma = prior_log_depth_at(prediction(sigma=1e-3), px)
     np.testing.assert_allclose(sure, plane(px), atol=1e-3)
     np.testing.assert_allclose(sure_sigma, 1e-3, rtol=1e-3)
-    unsure, unsure_sigma = prior_log_depth_at(prediction(sigma=0.4), px)
-    assert (np.abs(unsure - middle) <= np.abs(plane(px) - middle) + 0.02).all()
-    assert np.std(unsure) < 0.7 * np.std(plane(px))
-    assert (unsure_sigma < 0.4).all()
+    uncertain, uncertain_sigma = prior_log_depth_at(prediction(sigma=0.4), px)
+    assert (np.abs(uncertain - middle) <= np.abs(plane(px) - middle) + 0.02).all()
+    assert np.std(uncertain) < 0.7 * np.std(plane(px))
+    assert (uncertain_sigma < 0.4).all()
     flat, _ = prior_log_depth_at(prediction(sigma=50.0), px)
     np.testing.assert_allclose(flat, middle, atol=0.03)
     holes = prediction()

@@ -71,9 +71,9 @@ def test_a_sequence_and_training_pairs_together(tiny_room: Path, pairs: Path, tm
     assert (figures["complete"], figures["not_judged"]) == (True, [])
     assert figures["mean_over_sets"]["as_predicted"]["delta1"] == 1.0
     assert figures["versions"]["slamdepth"]
-    for picture in ("judged_over_depth.png", f"judged_{tiny_room.name}.png", "judged_corner.png"):
-        assert cv2.imread(str(tmp_path / picture)) is not None, picture
-        assert picture in done.stdout.replace("\n", "")
+    for image in ("judged_over_depth.png", f"judged_{tiny_room.name}.png", "judged_corner.png"):
+        assert cv2.imread(str(tmp_path / image)) is not None, image
+        assert image in done.stdout.replace("\n", "")
 
 
 def test_a_model_without_metres_is_judged_after_the_fit(disparity: str, pairs: Path, tmp_path: Path) -> None:
@@ -119,16 +119,16 @@ def test_what_is_wrong_is_one_line(tiny_room: Path, pairs: Path, tmp_path: Path)
 def test_what_was_judged_before_an_end_is_written(
     ending: str, pairs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The second data set cannot be judged, or the user has had enough."""
+    """The second data set cannot be evaluated, or the user interrupts."""
     second = shutil.copytree(pairs, tmp_path / "second")
     third = shutil.copytree(pairs, tmp_path / "third")
     output = tmp_path / "judged.json"
     raised = ConfigError("made up") if ending == "error" else KeyboardInterrupt()
-    looked: list[int] = []
+    predicted: list[int] = []
 
     def predict(model: SensorDepth, frame: Frame) -> DepthPrediction:
-        looked.append(frame.index)
-        if len(looked) > 3:
+        predicted.append(frame.index)
+        if len(predicted) > 3:
             raise raised
         return measure(model, frame)
 
@@ -139,7 +139,7 @@ def test_what_was_judged_before_an_end_is_written(
     assert list(figures["data"]) == ["corner"]
     assert (figures["complete"], figures["not_judged"]) == (False, ["second", "third"])
     assert (tmp_path / "judged_corner.png").is_file()
-    kept = f"{output} has the 1 of 3 data sets judged so far"
+    kept = f"{output} has the 1 of 3 data sets evaluated so far"
     if ending == "error":
         assert (done.returncode, done.stderr) == (2, "error: made up\n")
         assert f"figures: {kept}\n" in done.stdout

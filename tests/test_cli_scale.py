@@ -155,7 +155,7 @@ def test_a_number_and_a_known_baseline(tiny_room: Path, tmp_path: Path) -> None:
         (("run", "ROOM", "--depth", "flat", "--depth-scale", "absent.yaml"), "cannot read the depth scale"),
         (("run", "ROOM", "--depth", "flat", "--depth-scale", "0"), "must be a positive number"),
         (("run", "ROOM", "--depth", "relative"), "'slamdepth scale SEQ --shift"),
-        (("run", "ROOM", "--depth", "relative", "--depth-scale", "2"), "a factor alone makes no metres"),
+        (("run", "ROOM", "--depth", "relative", "--depth-scale", "2"), "a scale alone does not make it"),
         (("run", "ROOM", "--depth", "flat", "--baseline-between", "0", "1"), "need its length"),
         (
             ("run", "ROOM", "--depth", "flat", "--baseline-m", "1", "--baseline-between", "0", "99"),

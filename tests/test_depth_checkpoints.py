@@ -103,7 +103,7 @@ def test_official_heads_say_what_they_are_and_predict(
     assert model.card.native_focal_px == pytest.approx(focal_px, abs=0.01)
     assert model.card.licence.startswith("Apache-2.0")
     assert [len(info.sha256) for info in model.weights] == [64, 64]
-    # Small pictures instead of the native size, for time.
+    # Small images instead of the native size, for time.
     model.card = replace(model.card, native_size=(60, 80), native_focal_px=75.0)
     prediction = model.predict(frame_of(focal=60.0))
     assert prediction.kind is DepthKind.METRIC

@@ -279,7 +279,7 @@ def test_onnx_must_say_what_it_means(tmp_path: Path) -> None:
         assert "\n" not in str(error.value)
 
     write_onnx(path, None, (28, 42))
-    refused(r'does not say what its numbers mean; write .*net\.onnx\.json with at least \{"kind": K\}')
+    refused(r'does not say what its values mean; write .*net\.onnx\.json with at least \{"kind": K\}')
     beside.write_text('{"kind": "depth"}', encoding="utf-8")
     refused(r"net\.onnx\.json: kind: ")
     beside.write_text("{", encoding="utf-8")

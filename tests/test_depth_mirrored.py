@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mean of an image's depth and its mirror image's."""
+"""The mean of the predictions for an image and for its mirror image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from slamdepth.depth.registry import create_depth_model, depth_model_names, is_d
 from slamdepth.errors import ConfigError
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
 
-DOWN = np.array([0.6, 0.64, 0.48])
+GRAVITY = np.array([0.6, 0.64, 0.48])
 
 
 def frame(gravity: np.ndarray | None = None) -> Frame:
@@ -23,39 +23,39 @@ def frame(gravity: np.ndarray | None = None) -> Frame:
 
 
 class Left:
-    """Says of a pixel how far from the left it is, 1 to 4, in units of red; finds gravity by itself."""
+    """Predicts 1 to 4 by the column of a pixel, whatever the image; estimates gravity."""
 
     name = "left"
     weights = (WeightsInfo("left", "00", "nothing", "none"),)
 
     def __init__(self, kind: DepthKind = DepthKind.METRIC, unknown: tuple[int, ...] = ()) -> None:
         self.kind, self.unknown = kind, unknown
-        self.seen: list[Frame] = []
+        self.frames: list[Frame] = []
 
     def predict(self, frame: Frame) -> DepthPrediction:
-        self.seen.append(frame)
+        self.frames.append(frame)
         values = np.tile(np.arange(1, 5, dtype=np.float32), (3, 1))
         values[:, list(self.unknown)] = 0
-        return DepthPrediction(values, self.kind, values / 10, gravity=DOWN, gravity_share=0.7)
+        return DepthPrediction(values, self.kind, values / 10, gravity=GRAVITY, gravity_share=0.7)
 
 
-def test_the_mean_is_that_of_both_looks() -> None:
+def test_metric_depth_is_the_geometric_mean_of_both_predictions() -> None:
     prediction = MirroredDepth(Left()).predict(frame())
     assert prediction.sigma_log is not None
     np.testing.assert_allclose(prediction.values[0], [2.0, 6**0.5, 6**0.5, 2.0], rtol=1e-6)
     np.testing.assert_allclose(prediction.sigma_log, prediction.values / 10, rtol=1e-6)
     assert prediction.values.dtype == np.float32
-    assert prediction.gravity is DOWN
+    assert prediction.gravity is GRAVITY
     assert prediction.gravity_share == 0.7
 
 
-def test_numbers_without_metres_have_the_plain_mean() -> None:
+def test_relative_depth_is_the_arithmetic_mean() -> None:
     prediction = MirroredDepth(Left(DepthKind.AFFINE_INVERSE_DEPTH)).predict(frame())
     assert prediction.kind is DepthKind.AFFINE_INVERSE_DEPTH
     np.testing.assert_allclose(prediction.values, 2.5)
 
 
-def test_what_one_look_does_not_know_the_other_says() -> None:
+def test_where_one_prediction_is_unknown_the_other_is_taken() -> None:
     prediction = MirroredDepth(Left(unknown=(0,))).predict(frame())
     np.testing.assert_allclose(prediction.values[0], [4.0, 6**0.5, 6**0.5, 4.0], rtol=1e-6)
     nothing = MirroredDepth(Left(unknown=(0, 3))).predict(frame())
@@ -63,10 +63,12 @@ def test_what_one_look_does_not_know_the_other_says() -> None:
 
 
 @pytest.mark.parametrize("gravity", [None, np.array([0.0, 1.0, 0.0])])
-def test_the_mirror_image_is_told_the_gravity_that_was_found(gravity: np.ndarray | None) -> None:
+def test_the_mirror_image_is_predicted_with_the_estimated_gravity(
+    gravity: np.ndarray | None,
+) -> None:
     model = Left()
     MirroredDepth(model).predict(frame(gravity))
-    as_taken, mirrored = model.seen
+    as_taken, mirrored = model.frames
     assert as_taken.gravity is gravity
     np.testing.assert_allclose(mirrored.gravity, [-0.6, 0.64, 0.48])
     np.testing.assert_array_equal(mirrored.image_rgb, as_taken.image_rgb[:, ::-1])
@@ -74,7 +76,7 @@ def test_the_mirror_image_is_told_the_gravity_that_was_found(gravity: np.ndarray
 
 
 def test_a_mirror_image_of_a_mirror_image_is_the_image() -> None:
-    taken = frame(DOWN)
+    taken = frame(GRAVITY)
     once = mirror_image(taken)
     twice = mirror_image(once)
     assert once.camera != taken.camera
@@ -84,7 +86,7 @@ def test_a_mirror_image_of_a_mirror_image_is_the_image() -> None:
     assert mirror_image(frame()).gravity is None
 
 
-def test_it_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mirrored_models_are_created_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     from slamdepth.depth import registry
 
     monkeypatch.setitem(registry._factories, "left", lambda **_: Left())
@@ -96,11 +98,18 @@ def test_it_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [is_depth_model_name(name) for name in names] == [True, True, True, False, False]
     with pytest.raises(ConfigError, match="unknown depth model 'right'; choose from: dinov2"):
         create_depth_model("mirrored:right")
+
+
+def test_a_sensor_of_any_name_is_not_mirrored() -> None:
     with pytest.raises(ConfigError, match="a sensor's depth needs no mirror; use 'sensor'"):
         create_depth_model("mirrored:sensor")
+    model = Left()
+    model.is_sensor = True
+    with pytest.raises(ConfigError, match="'mirrored:left': a sensor's depth needs no mirror; use 'left'"):
+        MirroredDepth(model)
 
 
-def test_its_card_is_that_of_the_model_it_looks_through(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_card_is_that_of_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
     from slamdepth.depth.card import ModelCard, card_of
 
     assert card_of(MirroredDepth(Left())) is None

@@ -68,7 +68,7 @@ def test_sensor_without_depth_says_what_to_do() -> None:
 
 
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (48, 64), (100, 30), (161, 97)])
-def test_prediction_is_at_the_frame_s_resolution(width: int, height: int) -> None:
+def test_prediction_is_at_the_resolution_of_the_frame(width: int, height: int) -> None:
     prediction = tiny_model().predict(frame_of(width, height))
     assert prediction.values.shape == (height, width)
     assert prediction.values.dtype == np.float32
@@ -87,7 +87,7 @@ def test_prediction_is_deterministic_and_scales_with_the_focal_length() -> None:
     np.testing.assert_allclose(longer.values, 2 * first.values, rtol=1e-5)
 
 
-def test_the_default_says_what_it_learnt_from() -> None:
+def test_the_default_model_names_its_training_data() -> None:
     head = WeightsInfo("head", "ab", "six places", "free")
     model = Dinov2Depth(DinoV2(24, 2, 3, grid=5), HeadEnsemble(HeadShape((0, 1), 24, 16, 1, 8)), (head,))
     assert model.card == ModelCard("dinov2", DepthKind.METRIC, (238, 322), 280.0, "free", "six places")
@@ -99,7 +99,7 @@ def test_the_default_says_what_it_learnt_from() -> None:
     assert model_lines(create_depth_model("sensor")) == ["sensor: metric depth"]
 
 
-def test_prediction_refuses_slivers() -> None:
+def test_images_too_small_or_too_narrow_are_refused() -> None:
     with pytest.raises(CameraError, match="sides of at least"):
         tiny_model().predict(frame_of(20, 20))
     with pytest.raises(CameraError, match="aspect"):
@@ -122,7 +122,7 @@ def test_an_unknown_device_is_one_line(model: str, device: str) -> None:
         create_depth_model(model, device=device)
 
 
-def test_a_plug_in_is_given_a_device_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plug_in_gets_available_devices_only(monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[str] = []
 
     def factory(*, device: str, seed: int) -> object:
@@ -150,7 +150,7 @@ def test_missing_backbone_names_the_command(monkeypatch: pytest.MonkeyPatch, tmp
 
 
 class _Scaled:
-    """Sensor depth times a factor, with a given sigma: what a perfect judge must find."""
+    """Sensor depth times a factor, with a given sigma: an error that must be found exactly."""
 
     name, kind, weights = "scaled", DepthKind.METRIC, ()
 
@@ -163,14 +163,14 @@ class _Scaled:
         return DepthPrediction(values, self.kind, np.full_like(values, self.sigma))
 
 
-def test_judging_a_known_error() -> None:
-    seen: list[int] = []
+def test_a_known_error_is_measured() -> None:
+    watched: list[int] = []
     judged = judge_depth(
         _Scaled(1.1, 0.2),
         [frame_of(), frame_of(depth=False)],
-        watch=lambda frame, prediction: seen.append(frame.index),
+        watch=lambda frame, prediction: watched.append(frame.index),
     )
-    assert judged.frames == len(seen) == 1
+    assert judged.frames == len(watched) == 1
     assert judged.ways["as_predicted"]["abs_rel"].value == pytest.approx(0.1, abs=1e-6)
     assert judged.ways["frame_median"]["abs_rel"].value == pytest.approx(0.0, abs=1e-6)
     assert judged.within_one_sigma is not None
@@ -180,7 +180,7 @@ def test_judging_a_known_error() -> None:
     assert wrong.within_one_sigma.value == 0.0
 
 
-def test_judging_without_any_depth_is_an_error() -> None:
+def test_evaluation_without_any_sensor_depth_is_an_error() -> None:
     with pytest.raises(DatasetError, match="no frame has sensor depth"):
         judge_depth(_Scaled(1.0, 0.1), [frame_of(depth=False)])
 

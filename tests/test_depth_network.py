@@ -156,7 +156,7 @@ def test_convex_upsampling_stays_between_its_neighbours() -> None:
     assert fine.shape == (1, 2, 28, 35)
     assert fine.min() >= coarse.min()
     assert fine.max() <= coarse.max()
-    # all weight on the middle neighbour (4 of 0..8) is plain repetition
+    # all weight on the middle neighbour (4 of 0..8) is nearest-neighbour upsampling
     logits = torch.full((1, 9, 49, 4, 5), -50.0)
     logits[:, 4] = 50.0
     repeated = coarse.repeat_interleave(7, 2).repeat_interleave(7, 3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No tensor is left on the wrong device where networks run on a GPU; none is needed to see that."""
+"""No tensor is left on the wrong device when networks run on a GPU, checked on a pretended one."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ from slamdepth.depth.head import HeadEnsemble, HeadShape
 from slamdepth.depth.mirrored import MirroredDepth
 from slamdepth.depth.model import Dinov2Depth
 from slamdepth.depth.registry import create_depth_model
-from slamdepth.training import gravity_direction as training_down
-from slamdepth.training import loop, out_of_fold
+from slamdepth.training import gravity_direction, loop, out_of_fold
 from slamdepth.training.config import TrainConfig
 from slamdepth.types import Camera, Frame
 
@@ -45,7 +44,7 @@ def corridor() -> Frame:
     return Frame(0, 0.0, image, Camera(320, 240, 260.0, 260.0, 159.5, 119.5))
 
 
-def test_pretending_tells_what_is_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_operation_on_both_devices_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with pretend_cuda(monkeypatch):
         layer = torch.nn.Linear(3, 2).to("cuda")
         assert layer(torch.ones(1, 3).to("cuda")).cpu().shape == (1, 2)
@@ -56,16 +55,16 @@ def test_pretending_tells_what_is_mixed(monkeypatch: pytest.MonkeyPatch) -> None
     assert not layer(torch.ones(1, 3, device="meta")).is_cpu
 
 
-def test_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every part of it: lines, gravity, a second look, doubt; gravity given; and the mirror image."""
+def test_the_default_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lines, gravity, the rotated image and uncertainty; with gravity given; and the mirror image."""
     with pretend_cuda(monkeypatch):
         model = Dinov2Depth(tiny_backbone(), HeadEnsemble(SHAPE).eval(), (), "cuda")
         frame = corridor()
         found = model.predict(frame)
         assert found.gravity is not None
-        told = replace(frame, gravity=np.array([0.6, 0.8, 0.0]))
+        with_gravity = replace(frame, gravity=np.array([0.6, 0.8, 0.0]))
         for one in (model, MirroredDepth(model)):
-            assert one.predict(told).values.shape == (240, 320)
+            assert one.predict(with_gravity).values.shape == (240, 320)
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +83,9 @@ def test_published_checkpoints(name: str, monkeypatch: pytest.MonkeyPatch, publi
 
 
 def test_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """All that ``train-depth`` learns: heads, which way is down, doubt of places left out."""
+    """All that ``train-depth`` trains: heads, gravity, and uncertainty on places left out."""
     monkeypatch.setenv("SLAMDEPTH_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(training_down, "STEPS", 2)
+    monkeypatch.setattr(gravity_direction, "STEPS", 2)
     monkeypatch.setattr(out_of_fold, "_STEPS", 2)
     data = tmp_path / "data"
     for count, name in enumerate(("hall", "loft", "shop"), start=3):

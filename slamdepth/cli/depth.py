@@ -43,7 +43,9 @@ def depth_command(
     stride: StrideOption = 1,
     colour_range: Annotated[
         tuple[float, float] | None,
-        typer.Option("--range", metavar="NEAR FAR", help="Ends of the colours in metres. Default: found"),
+        typer.Option(
+            "--range", metavar="NEAR FAR", help="Depth range of the colours, metres. Default: found"
+        ),
     ] = None,
     no_cloud: Annotated[
         bool, typer.Option("--no-cloud", help="Write no point clouds, the largest files.")
@@ -55,13 +57,14 @@ def depth_command(
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Write depth maps: colour, 16-bit millimetres, NumPy, point cloud; of a video also a film.
+    """Write depth maps: colour, 16-bit millimetres, NumPy, point cloud; for a video also an mp4.
 
     Example: slamdepth depth holiday.mp4 --stride 5 --output holiday-depth
 
-    Metres need the focal length: --camera, a camera.yaml beside the images, a known sequence, or EXIF.
+    Metres need the focal length: from --camera, a camera.yaml in the folder of the images, a known sequence,
+    or EXIF.
 
-    Else it is guessed, and the results say so.
+    Otherwise it is guessed, and the results say so.
 
     Ctrl-C keeps what is done; the same command goes on from there.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``slamdepth eval-depth``: a depth model against sensor depth."""
+"""``slamdepth eval-depth``: evaluate a depth model against sensor depth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SHEET_FRAMES = 4
 
 def eval_depth_command(
     model: Annotated[
-        str, typer.Argument(metavar="MODEL", help="Depth model; an unknown name lists those there are.")
+        str, typer.Argument(metavar="MODEL", help="Depth model; an unknown name lists the known ones.")
     ],
     data: Annotated[
         list[Path],
@@ -37,22 +37,22 @@ def eval_depth_command(
     camera: CameraOption = None,
     stride: Annotated[
         int | None,
-        typer.Option(min=1, metavar="N", help="Judge every Nth frame. Default: 10, of training pairs 1"),
+        typer.Option(min=1, metavar="N", help="Evaluate every Nth frame. Default: 10; 1 for training pairs"),
     ] = None,
     max_frames: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Judge no more than N frames of each DATA.")
+        int | None, typer.Option(min=1, metavar="N", help="Evaluate at most N frames of each DATA.")
     ] = None,
     device: DeviceOption = "cpu",
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="Write all figures here, as JSON, and pictures beside it."
+            "--output", "-o", metavar="FILE", help="Write all figures here, as JSON, with images next to it."
         ),
     ] = None,
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Judge predicted depth against a depth sensor: as predicted, and scaled three ways.
+    """Evaluate predicted depth against a depth sensor: as predicted, and scaled in three ways.
 
     Example: slamdepth eval-depth dinov2 rgbd_dataset_freiburg1_rpy --stride 20 --output rpy.json
     """
@@ -66,7 +66,7 @@ def eval_depth_command(
 
     if Path(model).is_dir():
         raise ConfigError(
-            f"{model}: is a folder where the depth model's name belongs; the order is "
+            f"{model}: is a folder, where a depth model's name is expected; the order is "
             "'slamdepth eval-depth MODEL DATA...'"
         )
     if output is not None:
@@ -79,12 +79,12 @@ def eval_depth_command(
     judged: dict[str, DepthJudgement] = {}
     settings = {"stride": stride, "max_frames": max_frames, "device": device}
     written: list[str] = []
-    pictures: dict[str, None] = {}
+    images: dict[str, None] = {}
 
     def kept() -> str:
         if not written:
             return "nothing was written"
-        return f"{output} has the {len(written)} of {len(places)} data sets judged so far"
+        return f"{output} has the {len(written)} of {len(places)} data sets evaluated so far"
 
     try:
         with telling_what_is_kept(kept):
@@ -95,7 +95,7 @@ def eval_depth_command(
                     left = [one.name for one in places[number:]]
                     _write_figures(output, network, settings, judged, left)
                     written.append(name)
-                    pictures |= dict.fromkeys(_draw(output, network, name, judged, sheet))
+                    images |= dict.fromkeys(_draw(output, network, name, judged, sheet))
                 out.print(
                     judgement_table(judged[name].ways, f"{network.name} ({network.kind.value}) on {name}")
                 )
@@ -108,15 +108,15 @@ def eval_depth_command(
     if len(judged) > 1:
         mean = mean_over_sets(list(judged.values()))
         shown = {way: {name: Interval(v) for name, v in figures.items()} for way, figures in mean.items()}
-        out.print(judgement_table(shown, f"mean over the {len(judged)} data sets, each counts the same"))
+        out.print(judgement_table(shown, f"mean over the {len(judged)} data sets, equally weighted"))
     if output is not None:
-        out.print(f"figures: {output}, pictures: {', '.join(pictures)}", markup=False, soft_wrap=True)
+        out.print(f"figures: {output}, images: {', '.join(images)}", markup=False, soft_wrap=True)
 
 
 def _judge(
     model: DepthModel, place: Place, indices: Sequence[int], quiet: bool
 ) -> tuple[DepthJudgement, list[SheetRow]]:
-    """Judge one data set, and keep some of its frames for the sheet."""
+    """Evaluate one data set, and keep a few of its frames for the contact sheet."""
     import numpy as np
     from rich.progress import track
 
@@ -138,7 +138,7 @@ def _judge(
 
     err = error_console()
     frames = track(
-        readable(place, indices), f"judging on {place.name}", total=len(indices), console=err, transient=True,
+        readable(place, indices), f"evaluating {place.name}", total=len(indices), console=err, transient=True,
         disable=quiet or not err.is_terminal,
     )  # fmt: skip
     return judge_depth(model, frames, watch=watch), rows
@@ -151,7 +151,7 @@ def _write_figures(
     judged: Mapping[str, DepthJudgement],
     left: Sequence[str],
 ) -> None:
-    """Write the JSON file of the data sets judged so far; those ``left`` are named in it."""
+    """Write the JSON file of the data sets evaluated so far; it names those that are ``left``."""
     from dataclasses import asdict
 
     from slamdepth.depth.card import card_of
@@ -184,14 +184,18 @@ def _draw(
     judged: Mapping[str, DepthJudgement],
     sheet: Sequence[SheetRow],
 ) -> list[str]:
-    """Beside the JSON file one plot of all data sets so far and a sheet of ``name``; their names."""
+    """Draw a plot of all data sets so far and a contact sheet of ``name``, next to the JSON file.
+
+    Returns:
+        The names of the image files.
+    """
     from slamdepth.report.depth import write_over_depth, write_sheet
     from slamdepth.types import DepthKind
 
-    pictures = [output.with_name(f"{output.stem}_over_depth.png")]
-    write_over_depth(pictures[0], judged, model.name)
+    images = [output.with_name(f"{output.stem}_over_depth.png")]
+    write_over_depth(images[0], judged, model.name)
     if sheet:
         scaled = f"after each frame's {'median' if model.kind is DepthKind.METRIC else 'affine fit'}"
-        pictures.append(output.with_name(f"{output.stem}_{name}.png"))
-        write_sheet(pictures[1], sheet, scaled, f"{model.name} on {name}")
-    return [picture.name for picture in pictures]
+        images.append(output.with_name(f"{output.stem}_{name}.png"))
+        write_sheet(images[1], sheet, scaled, f"{model.name} on {name}")
+    return [image.name for image in images]

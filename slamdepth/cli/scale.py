@@ -30,7 +30,7 @@ def scale_command(
         bool,
         typer.Option(
             "--shift",
-            help="Fit a shift too: in metres of depth; in 1/m for models that predict inverse depth.",
+            help="Fit a shift too: in metres, or in 1/m for models that predict inverse depth.",
         ),
     ] = False,
     camera: CameraOption = None,
@@ -69,7 +69,7 @@ def scale_command(
     if not dataset.has_depth:
         raise DatasetError(
             f"{sequence}: has no sensor depth to fit a scale to; 'slamdepth run SEQ --depth-scale "
-            "groundtruth' can take one from a ground truth trajectory"
+            "groundtruth' can take a scale from a ground truth trajectory"
         )
     if output is not None:
         output = writable_file(output, ".yaml")
@@ -94,7 +94,7 @@ def scale_command(
     if output is not None:
         write_scale(output, fit)
     if not quiet:
-        kept = f"scale: {output}" if output is not None else "not kept: add --output FILE"
+        kept = f"scale: {output}" if output is not None else "not written: add --output FILE"
         out.print(
             f"{kept}; apply it with 'slamdepth run SEQ --depth-scale FILE'", markup=False, soft_wrap=True
         )

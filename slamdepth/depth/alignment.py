@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what a depth model says to metres of the map.
+"""From a depth prediction to metres of the map.
 
-The one place where a :class:`DepthPrediction` becomes depth. A prediction is taken as
-right up to an error that is mostly common to the image and otherwise smooth over it and
-over surfaces. That error is observed wherever the map already has a point, so it is
-estimated there and interpolated in between: Gaussian process regression of the log ratio
-of map depth to predicted depth, over pixel position and predicted depth (Rasmussen and
-Williams, "Gaussian Processes for Machine Learning", 2006, eq. 2.25-2.26). Where the map
-knows nothing the prior's own deviation remains, so the answer always comes with its
-uncertainty.
+The only place where a :class:`DepthPrediction` becomes depth. The error of a prediction is modelled as mostly
+common to the image and otherwise smooth over the image and over surfaces. It is observed wherever the map
+already has a landmark and interpolated in between, by Gaussian process regression of the log ratio of map
+depth to predicted depth over pixel position and predicted depth (Rasmussen and Williams, "Gaussian Processes
+for Machine Learning", 2006, eq. 2.25-2.26). Far from landmarks the uncertainty of the prior remains.
 """
 
 from __future__ import annotations
@@ -27,24 +24,24 @@ if TYPE_CHECKING:
 
 
 DEFAULT_SIGMA_LOG = 0.25
-"""Deviation of log depth assumed where a model gives none."""
+"""Standard deviation of log depth, assumed where a model gives none."""
 
-RELIEF_SIGMA = 0.4
-"""How much log depth varies over an image of a room, as a standard deviation."""
+SHAPE_SIGMA_LOG = 0.4
+"""Standard deviation of log depth over an indoor image."""
 
 MAX_ANCHORS = 300
+"""Most landmarks that a field is fitted to."""
 
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """Shape of the prediction's error.
+    """Covariance of the prediction's error.
 
     Attributes:
-        length_px: correlation length over the image, pixels of a 640 wide image.
-        length_log: correlation length over log depth: points at another depth belong
-            to another surface.
-        white_share: share of the variance that no neighbour tells anything about.
-        common_sigma: deviation of the log scale common to the image.
+        length_px: correlation length over the image, in pixels of an image 640 wide.
+        length_log: correlation length over log depth: points at another depth belong to another surface.
+        white_share: share of the variance that is independent from pixel to pixel.
+        common_sigma: standard deviation of the log scale common to the image.
     """
 
     length_px: float = 80.0
@@ -54,7 +51,13 @@ class FieldSettings:
 
 
 class DepthField:
-    """A prediction tied to the map's points: log depth and its deviation at any pixel."""
+    """A prediction fitted to landmarks: correction of log depth and its standard deviation at any pixel.
+
+    Made by :func:`fit_depth_field`.
+
+    Attributes:
+        offset: log ratio of map to prediction, expected before any landmark is observed.
+    """
 
     def __init__(
         self,
@@ -75,15 +78,16 @@ class DepthField:
 
     @property
     def anchors(self) -> int:
-        """Number of map points the field was tied to."""
+        """Number of landmarks the field was fitted to."""
         return len(self._px)
 
     def correction(self, px: Floats, log_predicted: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-        """Log correction and posterior deviation at pixels.
+        """Correction of log depth and its posterior standard deviation at pixels.
 
         Args:
-            px: ``(N, 2)`` raw pixels; log_predicted: ``(N,)``; sigma: ``(N,)`` the
-                prediction's own deviation.
+            px: ``(N, 2)`` raw pixels.
+            log_predicted: ``(N,)`` natural log of predicted depth.
+            sigma: ``(N,)`` the prediction's own standard deviation.
 
         Returns:
             ``(correction (N,), sigma (N,))``; add the first to ``log_predicted``.
@@ -103,7 +107,13 @@ class DepthField:
         return mean, np.sqrt(np.maximum(variance - reduction, np.maximum(floor, 1e-6)))
 
     def mean(self, px: Floats, log_predicted: Floats, sigma: Floats) -> Floats:
-        """Only the log correction ``(N,)``; cheaper, for dense maps."""
+        """Correction of log depth ``(N,)`` at pixels, without its deviation: cheaper, for dense maps.
+
+        Args:
+            px: ``(N, 2)`` raw pixels.
+            log_predicted: ``(N,)`` natural log of predicted depth.
+            sigma: ``(N,)`` the prediction's own standard deviation.
+        """
         if self._factor is None:
             return np.full(len(px), self.offset)
         return (
@@ -114,7 +124,7 @@ class DepthField:
     def _kernel(
         self, pa: Floats, la: Floats, sa: Floats, pb: Floats, lb: Floats, sb: Floats
     ) -> NDArray[np.float32]:
-        """In single precision, which is much faster and finer than any noise in it."""
+        """Covariance ``(A, B)`` of the error, in single precision: much faster and accurate enough."""
         s = self._settings
         scale = np.array([s.length_px * self._unit_px, s.length_px * self._unit_px, s.length_log])
         a, b = ((np.column_stack([p, log]) / scale).astype(np.float32) for p, log in ((pa, la), (pb, lb)))
@@ -129,14 +139,18 @@ class DepthField:
 
 
 def log_depth_at(prediction: DepthPrediction, px: Floats) -> tuple[Floats, Floats]:
-    """Natural log of a metric prediction and its deviation at raw pixels ``(N, 2)``, nearest neighbour.
+    """Natural log of predicted depth and its standard deviation at pixels, by nearest neighbour.
+
+    Args:
+        prediction: metric.
+        px: ``(N, 2)`` raw pixels.
 
     Returns:
-        ``(log depth (N,), sigma (N,))``; NaN where the depth is unknown.
+        ``(log depth (N,), sigma (N,))``; log depth is NaN where it is unknown.
 
     Raises:
-        TrackingError: the prediction is not metric. Relative depth has to be made metric
-            against known points first; taking disparity for depth is never right.
+        TrackingError: the prediction is not metric. Relative depth has to be scaled first; taking disparity
+            for depth is never right.
     """
     u = np.clip(np.rint(px[:, 0]).astype(np.int64), 0, prediction.values.shape[1] - 1)
     v = np.clip(np.rint(px[:, 1]).astype(np.int64), 0, prediction.values.shape[0] - 1)
@@ -147,12 +161,21 @@ def log_depth_at(prediction: DepthPrediction, px: Floats) -> tuple[Floats, Float
 
 
 def prior_log_depth_at(prediction: DepthPrediction, px: Floats) -> tuple[Floats, Floats]:
-    """Prior log depth and deviation at raw pixels ``(N, 2)``: the prediction as far as it is sure.
+    """Prior log depth and its standard deviation at pixels: the prediction, shrunk where it is uncertain.
 
-    Rooms have a relief of their own: log depth varies over an image by about
-    ``RELIEF_SIGMA``. Weighed against that (the posterior mean of two Gaussians), an unsure
-    prediction shrinks towards a wall at its own median distance. Wrong relief is worse
-    than none: it bends rays so that a sideways motion looks like a turn.
+    Log depth varies over an indoor image by about ``SHAPE_SIGMA_LOG``. The prior is the posterior mean of two
+    Gaussians, that one and the prediction, so an uncertain prediction shrinks towards a wall at its own
+    median distance. A wrong shape is worse than a flat one: it makes a sideways motion look like a rotation.
+
+    Args:
+        prediction: metric.
+        px: ``(N, 2)`` raw pixels.
+
+    Returns:
+        ``(log depth (N,), sigma (N,))``; log depth is NaN where it is unknown.
+
+    Raises:
+        TrackingError: the prediction is not metric.
     """
     log, sigma = log_depth_at(prediction, px)
     centre, gain = _centre(prediction), _gain(sigma)
@@ -160,8 +183,8 @@ def prior_log_depth_at(prediction: DepthPrediction, px: Floats) -> tuple[Floats,
 
 
 def _gain(sigma_log: Any) -> Any:
-    """How much of a deviation from the image's median is kept, 0 to 1."""
-    return RELIEF_SIGMA**2 / (RELIEF_SIGMA**2 + sigma_log**2)
+    """Share of a deviation from the image's median that is kept, 0 to 1."""
+    return SHAPE_SIGMA_LOG**2 / (SHAPE_SIGMA_LOG**2 + sigma_log**2)
 
 
 def _centre(prediction: DepthPrediction) -> float:
@@ -191,14 +214,17 @@ def fit_depth_field(
     prior_offset: float = 0.0,
     settings: FieldSettings | None = None,
 ) -> DepthField:
-    """Tie a prediction to map points.
+    """Fit the error of a prediction to landmarks.
 
     Args:
-        px: ``(N, 2)`` raw pixels of known points; log_predicted, sigma: ``(N,)`` the
-            prediction there; log_map, sigma_map: ``(N,)`` log depth of the map's points
-            in this camera, and its deviation.
-        width: image width in pixels, which ``length_px`` is scaled by.
-        prior_offset: expected log ratio of map to prediction before any point is seen.
+        px: ``(N, 2)`` raw pixels of landmarks.
+        log_predicted: ``(N,)`` natural log of predicted depth there; NaN is left out.
+        sigma: ``(N,)`` standard deviation of ``log_predicted``.
+        log_map: ``(N,)`` natural log of the landmarks' depth in this camera; outliers are left out.
+        sigma_map: ``(N,)`` standard deviation of ``log_map``.
+        width: of the image in pixels, by which ``length_px`` is scaled.
+        prior_offset: log ratio of map to prediction, expected before any landmark is observed.
+        settings: covariance of the error.
     """
     settings = settings or FieldSettings()
     ratio = log_map - log_predicted
@@ -209,8 +235,8 @@ def fit_depth_field(
         good &= np.abs(ratio - median) < 3.5 * spread
     index = np.flatnonzero(good)
     if len(index) > MAX_ANCHORS:
-        surest = index[np.argsort(sigma_map[index], kind="stable")[: 2 * MAX_ANCHORS]]
-        index = np.sort(surest[:: max(1, len(surest) // MAX_ANCHORS)][:MAX_ANCHORS])
+        best = index[np.argsort(sigma_map[index], kind="stable")[: 2 * MAX_ANCHORS]]
+        index = np.sort(best[:: max(1, len(best) // MAX_ANCHORS)][:MAX_ANCHORS])
     unit_px = width / 640.0
     field = DepthField(
         px[index],
@@ -236,31 +262,52 @@ def fit_depth_field(
 def coarse_correction(
     field: DepthField, prediction: DepthPrediction, step_px: int = 16
 ) -> NDArray[np.float32]:
-    """The log correction of a whole prediction on a grid ``(h, w)`` over its pixels.
+    """Correction of a whole prediction's log depth, on a coarse grid.
 
-    It is smooth, so a value about every ``step_px`` pixels is enough.
+    The correction is smooth, so one value about every ``step_px`` pixels is enough.
+
+    Args:
+        field: fitted to the prediction.
+        prediction: metric.
+        step_px: distance of grid points in pixels; the grid covers the image from edge to edge.
+
+    Returns:
+        ``(h, w)`` float32.
+
+    Raises:
+        TrackingError: the prediction is not metric.
     """
     height, width = prediction.values.shape
-    # the grid ends on the last row and column: nothing is extrapolated
+    # The grid ends on the last row and column, so that nothing is extrapolated.
     rows = np.linspace(0, height - 1, -(-(height - 1) // step_px) + 1)
     cols = np.linspace(0, width - 1, -(-(width - 1) // step_px) + 1)
     grid_u, grid_v = np.meshgrid(cols, rows)
     px = np.column_stack([grid_u.ravel(), grid_v.ravel()]).astype(np.float64)
-    at, doubt = prior_log_depth_at(prediction, px)
+    log, sigma = prior_log_depth_at(prediction, px)
     centre = _centre(prediction)
-    doubt = np.nan_to_num(doubt, nan=DEFAULT_SIGMA_LOG)
-    coarse = field.mean(px, np.nan_to_num(at, nan=centre), doubt).reshape(grid_u.shape)
+    sigma = np.nan_to_num(sigma, nan=DEFAULT_SIGMA_LOG)
+    coarse = field.mean(px, np.nan_to_num(log, nan=centre), sigma).reshape(grid_u.shape)
     return np.asarray(coarse, np.float32)
 
 
 def as_given(prediction: DepthPrediction) -> NDArray[np.float32]:
-    """A prediction, or a sensor's depth, whose metres are the map's: ``(H, W)``, 0 = unknown."""
+    """Depth ``(H, W)`` of a prediction whose metres are the map's, such as a sensor's; 0 = unknown."""
     return prediction.values
 
 
 def corrected_depth(coarse: NDArray[np.float32], prediction: DepthPrediction) -> NDArray[np.float32]:
-    """A prediction with the correction of :func:`coarse_correction`: metres of the map,
-    ``(H, W)`` float32, 0 = unknown."""
+    """Depth of a prediction in metres of the map: its prior with the correction added.
+
+    Args:
+        coarse: ``(h, w)`` from :func:`coarse_correction`.
+        prediction: metric, the one that ``coarse`` was made for.
+
+    Returns:
+        ``(H, W)`` float32, 0 = unknown.
+
+    Raises:
+        TrackingError: the prediction is not metric.
+    """
     import cv2
 
     height, width = prediction.values.shape
@@ -276,7 +323,7 @@ def corrected_depth(coarse: NDArray[np.float32], prediction: DepthPrediction) ->
     log -= np.float32(centre)
     if prediction.sigma_log is None:
         log *= np.float32(_gain(DEFAULT_SIGMA_LOG))
-    else:  # in single precision: arithmetic in half is many times slower
+    else:  # single precision: arithmetic in half precision is many times slower
         sigma = prediction.sigma_log.astype(np.float32)
         log *= _gain(np.nan_to_num(sigma, copy=False, nan=DEFAULT_SIGMA_LOG))
     log += dense

@@ -12,12 +12,12 @@ from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 class DepthModel(Protocol):
     """Turns a frame into a depth map.
 
+    A model that passes measured depth on also has an attribute ``is_sensor = True``, see :func:`is_sensor`.
+
     Attributes:
         name: the registered name.
-        kind: what the numbers of its predictions mean.
+        kind: what the values of its predictions mean.
         weights: every weights file the model uses; empty where it uses none.
-
-    A model may also have ``is_sensor = True``, see :func:`is_sensor`.
     """
 
     name: str
@@ -25,12 +25,12 @@ class DepthModel(Protocol):
     weights: tuple[WeightsInfo, ...]
 
     def predict(self, frame: Frame) -> DepthPrediction:
-        """Predict ``(H, W)`` depth for ``frame`` at the frame's own resolution."""
+        """Predict depth for every raw (not undistorted) pixel of ``frame``, ``(H, W)``."""
         ...
 
 
 def is_sensor(model: DepthModel) -> bool:
-    """Whether ``model`` passes measured depth on; it says so by an attribute ``is_sensor``, absent means no.
+    """Whether ``model`` passes measured depth on, by its attribute ``is_sensor``; without one it does not.
 
     A sensor costs no time, may have no depth for a frame, and its scale is exact.
     """

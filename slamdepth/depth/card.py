@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a depth model says of itself."""
+"""Facts about a depth model: what it predicts, and what it was trained on."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ class ModelCard:
 
     Attributes:
         name: the registered name.
-        kind: what its numbers mean.
-        native_size: rows and columns, in pixels, of the images it was trained on, as the
-            network saw them.
-        native_focal_px: focal length of those images in pixels at that size, or None
-            where it has none (several cameras, or values without metres).
+        kind: what its values mean.
+        native_size: rows and columns, in pixels, of the network's input in training.
+        native_focal_px: focal length of those inputs in pixels, or None where there is no single one (several
+            cameras, or values that are not metric).
         licence: of the weights.
         trained_on: the data.
     """
@@ -33,6 +32,6 @@ class ModelCard:
 
 
 def card_of(model: DepthModel) -> ModelCard | None:
-    """The card of a model; None for one without: a sensor learnt nothing, a plug-in need not have one."""
+    """The card of a model; None where it has none, such as a sensor or a plug-in."""
     card = getattr(model, "card", None)
     return card if isinstance(card, ModelCard) else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find, read and strictly load the weights files of depth networks people have."""
+"""Find, read and strictly load weights files of depth networks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def find_checkpoint(model: str, file_names: Sequence[str], given: str | Path | N
     """The weights file of ``model``: ``given``, else the first of ``file_names`` in the cache.
 
     Raises:
-        WeightsError: one line: the file's name and where to put it.
+        WeightsError: there is no such file; says its name and where to put it.
     """
     if given is not None:
         if Path(given).is_file():
@@ -42,9 +42,9 @@ def find_checkpoint(model: str, file_names: Sequence[str], given: str | Path | N
 
 
 def read_checkpoint(path: Path) -> dict[str, Tensor]:
-    """All tensors of a safetensors file or a PyTorch file, there also under ``state_dict``.
+    """All tensors of a safetensors or PyTorch file; of the latter also those under ``state_dict``.
 
-    PyTorch files are read as data only: nothing in them is run.
+    PyTorch files are read as data only: no code in them is run.
 
     Raises:
         WeightsError: the file cannot be read or holds something else.
@@ -55,7 +55,8 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
 
-            return load_file(str(path))
+            tensors: dict[str, Tensor] = load_file(str(path))
+            return tensors
         loaded = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # pickle, zip and safetensors each raise their own types
         if "Weights only load failed" in str(error):
@@ -81,13 +82,16 @@ def load_strictly(
     unused: Mapping[str, tuple[int, ...]] | None = None,
     device: str = "cpu",
 ) -> Module:
-    """Build a network and give it ``tensors``: every one it needs, and no other.
+    """Build a network and load ``tensors`` into it: every one it needs, and no other.
 
     Args:
-        build: makes the network; called on the meta device, so that nothing is
-            allocated or drawn at random. It must keep no tensors outside its state.
-        unused: tensors that official files have and inference does not need, with
-            their shapes; they may be there.
+        build: makes the network; called on the meta device, so that nothing is allocated or initialised. It
+            must keep no tensors outside its state.
+        tensors: by name.
+        origin: the file, named in errors.
+        unused: shapes by name of tensors that official files have and inference does not need; they may be
+            there.
+        device: where the network is put.
 
     Returns:
         The network in float32 and eval mode, frozen, on ``device``.
@@ -116,10 +120,10 @@ def load_strictly(
 
 
 def check_device(device: str) -> None:
-    """Make sure that ``device`` is one networks can run on here: ``cpu``, ``cuda`` or ``cuda:N``.
+    """Check that networks can run on ``device`` on this machine: ``cpu``, ``cuda`` or ``cuda:N``.
 
     Raises:
-        ConfigError: it is another name, there is no CUDA device, or not so many.
+        ConfigError: the name is unknown, or there is no such CUDA device.
     """
     check_device_name(device)
     if device == "cpu":
@@ -134,10 +138,10 @@ def check_device(device: str) -> None:
 
 
 def check_device_name(device: str) -> None:
-    """Make sure that ``device`` names one that networks can run on, wherever that may be.
+    """Check that ``device`` is a device's name: ``cpu``, ``cuda`` or ``cuda:N``; it need not be available.
 
     Raises:
-        ConfigError: it does not.
+        ConfigError: the name is unknown.
     """
     if not re.fullmatch(r"cpu|cuda(:(0|[1-9][0-9]*))?", device):
         raise ConfigError(

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read the DINOv2 ViT-S/14 inside an ONNX export back under its official names.
+"""Extract the DINOv2 ViT-S/14 from an ONNX export, under its official tensor names.
 
-The export names biases, norms and layer scales after the Hugging Face port; the Linear
-weights are anonymous and stored transposed, so they are found through the MatMul node
-that uses them. Query, key and value are stacked to the official ``attn.qkv``.
+The export names biases, norms and layer scales after the Hugging Face port. Its Linear weights are anonymous
+and transposed, so they are found through the MatMul node that uses them. Query, key and value are stacked to
+the official ``attn.qkv``.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ _QKV = ("query", "key", "value")
 
 
 def dinov2_from_onnx(path: Path) -> Tensors:
-    """The backbone of the ONNX file at ``path`` under official names, float32.
+    """The tensors of the backbone in the ONNX file at ``path``, by official name, float32.
 
     Raises:
-        WeightsError: the file is no ONNX model, or a tensor of the backbone is missing
-            or misshapen; names it.
+        WeightsError: the file is no ONNX model, or a tensor of the backbone is missing or misshapen; names
+            it.
     """
     import onnx
     from onnx import numpy_helper
@@ -78,7 +78,8 @@ def _renamed(initialisers: Tensors, matmuls: dict[str, str], origin: str) -> Ten
     def linear(node: str) -> NDArray[np.float32]:
         if node not in matmuls:
             raise WeightsError(f"{origin}: the weight of the node {node} is missing")
-        return initialisers[matmuls[node]].T
+        transposed: NDArray[np.float32] = initialisers[matmuls[node]].T
+        return transposed
 
     out: Tensors = {
         "cls_token": named("backbone.embeddings.cls_token"),

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth Anything V2 from its official files: relative inverse depth, or metres.
+"""Depth Anything V2 (Yang et al. 2024) from its official files: relative inverse depth, or metric depth.
 
-The relative and the metric files have the same tensors and only their names tell them
-apart, so a metric model takes no file whose name does not say what it was trained on.
+Relative and metric files have the same tensors and differ in their names only. A metric model therefore
+refuses a file whose name does not say what it was trained on.
 """
 
 from __future__ import annotations
@@ -29,12 +29,20 @@ from slamdepth.io import sha256_of
 from slamdepth.types import DepthKind, WeightsInfo
 
 SHORT_SIDE = 518
-"""The official input: the shorter side at least this, a multiple of 14."""
+"""Least pixels of the shorter side of the official input; sides are multiples of 14."""
 
 
 @dataclass(frozen=True)
 class _Training:
-    """What a set of weights was trained on; focal length in pixels of images of ``size``."""
+    """The training of one set of metric weights.
+
+    Attributes:
+        word: that names the data set in file names.
+        data: the data set.
+        max_depth_m: largest depth that is predicted.
+        focal_px: focal length in pixels of images of ``size``.
+        size: rows and columns of the network's input.
+    """
 
     word: str
     data: str
@@ -59,12 +67,14 @@ _METRIC_WORDS = ("metric", "hypersim", "vkitti", "indoor", "outdoor")
 
 
 class DepthAnythingV2(NetworkDepth):
-    """One of the published networks.
+    """A published Depth Anything V2 network as a depth model.
 
     Args:
         network: in eval mode.
-        card, weights, device: see :class:`NetworkDepth`.
-        short_side: pixels of the shorter side of the network's input; 518 is official.
+        card: what it was trained on and at which size and focal length.
+        weights: the file it was read from.
+        device: where it runs.
+        short_side: least pixels of the shorter side of the network's input; 518 is official.
     """
 
     def __init__(
@@ -87,12 +97,13 @@ class DepthAnythingV2(NetworkDepth):
 
         Args:
             size: ``"small"``, ``"base"`` or ``"large"``.
-            scene: None for relative inverse depth, ``"indoor"`` or ``"outdoor"`` for metres.
+            scene: None for relative inverse depth, ``"indoor"`` or ``"outdoor"`` for metric depth.
             weights: the file; default: by its official name from the cache folder.
+            device: where the network runs.
 
         Raises:
-            WeightsError: no file, or it is another one; says which and where to put it.
-            ConfigError: the device is not there.
+            WeightsError: the file is missing or another one; says which and where to put it.
+            ConfigError: the device is not available.
         """
         check_device(device)
         card, stem = model_card(size, scene)
@@ -121,7 +132,7 @@ class DepthAnythingV2(NetworkDepth):
 
 
 def model_card(size: str, scene: str | None) -> tuple[ModelCard, str]:
-    """The card of a published model and the official name of its file without ending."""
+    """The card of a published model, and the official name of its file without its suffix."""
     code, _, licence = _SIZES[size]
     if scene is None:
         name = f"depth-anything-v2-{size}"
@@ -136,8 +147,11 @@ def model_card(size: str, scene: str | None) -> tuple[ModelCard, str]:
 
 
 def network_size(height: int, width: int, short_side: int = SHORT_SIDE) -> tuple[int, int]:
-    """Rows and columns of the official input: the shorter side at least ``short_side``, the
-    aspect kept as far as multiples of 14 can."""
+    """Rows and columns of the official input of a ``height`` x ``width`` image.
+
+    The shorter side has at least ``short_side`` pixels, and sides are multiples of 14 that keep the aspect as
+    well as possible.
+    """
     scale = max(short_side / height, short_side / width)
 
     def fitted(pixels: int) -> int:
@@ -150,7 +164,8 @@ def network_size(height: int, width: int, short_side: int = SHORT_SIDE) -> tuple
 
 
 def _prepared(image_rgb: NDArray[np.uint8], rows: int, columns: int, device: str) -> torch.Tensor:
-    """Resized bicubically in floating point, as the official code does, and normalised."""
+    """The network's input ``(1, 3, rows, columns)``: resized bicubically in floating point, as the official
+    code does, and normalised."""
     import cv2
 
     image = image_rgb.astype(np.float32) / np.float32(255.0)
@@ -162,7 +177,11 @@ def _prepared(image_rgb: NDArray[np.uint8], rows: int, columns: int, device: str
 
 
 def _check_name(path: Path, model: str, stem: str, scene: str | None) -> None:
-    """Nothing in the file tells relative from metric weights; its name must."""
+    """Check that the file's name fits the model: nothing else tells relative from metric weights.
+
+    Raises:
+        WeightsError: it does not.
+    """
     name = path.name.lower()
     if scene is None:
         if any(word in name for word in _METRIC_WORDS):

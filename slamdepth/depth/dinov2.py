@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""DINOv2 ViT (Oquab et al. 2023) without registers, in plain PyTorch, for inference.
+"""DINOv2 ViT (Oquab et al. 2023) without registers, in PyTorch, for inference.
 
-Parameter names are those of the official files, so both load without renaming.
+Parameter names are those of the official files.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ class _Attention(nn.Module):
         qkv = self.qkv(x).reshape(batch, tokens, 3, self.heads, dim // self.heads)
         query, key, value = qkv.permute(2, 0, 3, 1, 4)
         if x.dtype is torch.bfloat16 and x.device.type == "cpu":
-            # torch's fused kernel computes in float32 there; plain products are a third faster
+            # PyTorch's fused kernel computes in float32 there; separate products are a third faster.
             share = (query * query.shape[-1] ** -0.5 @ key.transpose(-1, -2)).softmax(dim=-1)
             out = share @ value
         else:
             out = F.scaled_dot_product_attention(query, key, value)
-        return self.proj(out.transpose(1, 2).reshape(batch, tokens, dim))
+        projected: Tensor = self.proj(out.transpose(1, 2).reshape(batch, tokens, dim))
+        return projected
 
 
 class _Mlp(nn.Module):
@@ -47,7 +48,8 @@ class _Mlp(nn.Module):
         self.fc2 = nn.Linear(4 * dim, dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(F.gelu(self.fc1(x)))
+        out: Tensor = self.fc2(F.gelu(self.fc1(x)))
+        return out
 
 
 class _LayerScale(nn.Module):
@@ -71,7 +73,8 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         x = x + self.ls1(self.attn(self.norm1(x)))
-        return x + self.ls2(self.mlp(self.norm2(x)))
+        x = x + self.ls2(self.mlp(self.norm2(x)))
+        return x
 
 
 class _PatchEmbed(nn.Module):
@@ -80,16 +83,19 @@ class _PatchEmbed(nn.Module):
         self.proj = nn.Conv2d(3, dim, patch, stride=patch)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.proj(x).flatten(2).transpose(1, 2)
+        patches: Tensor = self.proj(x)
+        return patches.flatten(2).transpose(1, 2)
 
 
 class DinoV2(nn.Module):
-    """The encoder; ``forward`` returns the tokens after chosen blocks.
+    """The ViT encoder; ``forward`` returns the tokens after chosen blocks.
 
     Args:
-        dim, depth, heads: width, number of blocks and of attention heads (ViT-S: 384, 12, 6).
-        patch: pixels per token side.
-        grid: side of the square position embedding.
+        dim: width of the tokens; the defaults are those of a ViT-S/14.
+        depth: number of blocks.
+        heads: number of attention heads.
+        patch: pixels of the image per token, along a side.
+        grid: tokens of the stored position embedding, along a side.
     """
 
     def __init__(
@@ -105,9 +111,9 @@ class DinoV2(nn.Module):
         self._resized: dict[tuple[int, int], Tensor] = {}
 
     def position_embedding(self, rows: int, columns: int) -> Tensor:
-        """Position embedding ``(1, 1 + rows * columns, dim)`` for another grid of tokens.
+        """Position embedding ``(1, 1 + rows * columns, dim)`` for a grid of ``rows`` x ``columns`` tokens.
 
-        Bicubic with DINOv2's offset of 0.1 in the scale factor, as its own code does.
+        Resized bicubically with an offset of 0.1 in the scale factor, as the official code does.
         """
         if (rows, columns) == (self.grid, self.grid):
             return self.pos_embed
@@ -120,15 +126,15 @@ class DinoV2(nn.Module):
         return torch.cat([self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2)], dim=1)
 
     def forward(self, image: Tensor, taps: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
-        """Tokens after the blocks ``taps`` (ascending, 0-based), through the final norm.
+        """Tokens after some of the blocks, through the final norm.
 
         Args:
-            image: ``(B, 3, H, W)`` normalised with the ImageNet mean and deviation; H
-                and W multiples of the patch size.
+            image: ``(B, 3, H, W)`` normalised with the ImageNet mean and deviation; H and W are multiples of
+                the patch size.
+            taps: numbers of the blocks, ascending, from 0.
 
         Returns:
-            For each tap the patch tokens ``(B, dim, H/patch, W/patch)`` and the class
-            token ``(B, dim)``.
+            For each tap the patch tokens ``(B, dim, H/patch, W/patch)`` and the class token ``(B, dim)``.
 
         Raises:
             ValueError: the image does not fit the patch size, or a tap does not exist.
@@ -167,10 +173,10 @@ class DinoV2(nn.Module):
 
 
 def working_type(device: str) -> torch.dtype:
-    """What the backbone computes in: bfloat16 on a CPU that multiplies it natively, float32 elsewhere.
+    """Type that the backbone computes in: bfloat16 on a CPU with native bfloat16 products, float32 elsewhere.
 
-    It nearly halves the time of a prediction and changes depth by about half a per cent,
-    where the head errs by ten.
+    bfloat16 nearly halves the time of a prediction. It changes depth by about half a per cent, where the head
+    errs by ten.
     """
     if device != "cpu" or not hasattr(torch.cpu, "get_capabilities"):
         return torch.float32
@@ -183,8 +189,7 @@ def load_dinov2(path: Path, device: str = "cpu") -> DinoV2:
     """The ViT-S/14 of a safetensors or official ``.pth`` file, frozen, in eval mode.
 
     Raises:
-        WeightsError: the file cannot be read, or a tensor is missing, extra or
-            misshapen; names it.
+        WeightsError: the file cannot be read, or a tensor is missing, extra or misshapen; names it.
     """
     tensors = read_checkpoint(path)
     check_layout(

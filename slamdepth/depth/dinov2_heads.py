@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth heads published with DINOv2 (Oquab et al. 2023): a linear one and a DPT.
+"""The depth heads published with DINOv2 (Oquab et al. 2023): a linear one and a DPT (Ranftl et al. 2021).
 
-Parameter names are those of the official files. Both read the tokens of their blocks
-before the final norm, each patch token together with the class token.
+Parameter names are those of the official files. Both heads read the tokens of their blocks before the final
+norm, each patch token together with the class token.
 """
 
 from __future__ import annotations
@@ -38,12 +38,11 @@ class LinearHead(nn.Module):
     def forward(self, tapped: Tapped) -> Tensor:
         """Depth ``(B, 4h, 4w)`` in metres.
 
-        The official code enlarges the tokens fourfold and then classifies; a pointwise
-        layer and bilinear enlarging commute, so here it is the other way round, for a
-        sixteenth of the work.
+        The official code upsamples the tokens fourfold and then classifies. A pointwise layer and bilinear
+        upsampling commute, so here it is the other way round, for a sixteenth of the work.
         """
         both = [torch.cat([x, token[:, :, None, None].expand_as(x)], dim=1) for x, token in tapped]
-        logits = self.conv_depth(torch.cat(both, dim=1))
+        logits: Tensor = self.conv_depth(torch.cat(both, dim=1))
         logits = F.interpolate(logits, scale_factor=4, mode="bilinear", align_corners=False)
         share = torch.relu(logits) + 0.1
         share = share / share.sum(dim=1, keepdim=True)
@@ -52,14 +51,15 @@ class LinearHead(nn.Module):
 
 
 class _Conv(nn.Module):
-    """A convolution under the name ``conv``, as the official files have it."""
+    """A convolution under the name ``conv``, as in the official files."""
 
     def __init__(self, in_channels: int, out_channels: int, kernel: int, bias: bool = True) -> None:
         super().__init__()
         self.conv = nn.Conv2d(in_channels, out_channels, kernel, padding=kernel // 2, bias=bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.conv(x)
+        out: Tensor = self.conv(x)
+        return out
 
 
 class _Residual(nn.Module):
@@ -69,11 +69,12 @@ class _Residual(nn.Module):
         self.conv2 = _Conv(channels, channels, 3, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.conv2(F.relu(self.conv1(F.relu(x))))
+        residual: Tensor = self.conv2(F.relu(self.conv1(F.relu(x))))
+        return x + residual
 
 
 class _Fusion(nn.Module):
-    """Add a finer stage (there is none for the first fusion), refine, double the size."""
+    """Add a finer stage (the first fusion has none), refine, upsample twofold."""
 
     def __init__(self, channels: int, *, is_first: bool) -> None:
         super().__init__()
@@ -87,7 +88,8 @@ class _Fusion(nn.Module):
                 finer = F.interpolate(finer, size=x.shape[-2:], mode="bilinear", align_corners=False)
             x = x + self.res_conv_unit1(finer)
         x = F.interpolate(self.res_conv_unit2(x), scale_factor=2, mode="bilinear", align_corners=True)
-        return self.project(x)
+        out: Tensor = self.project(x)
+        return out
 
 
 class _Reassemble(nn.Module):
@@ -122,14 +124,15 @@ class _Output(nn.Module):
         super().__init__()
         self.head = nn.Sequential(
             nn.Conv2d(channels, channels // 2, 3, padding=1),
-            nn.UpsamplingBilinear2d(scale_factor=2),  # with corners aligned, as the official one
+            nn.UpsamplingBilinear2d(scale_factor=2),  # with aligned corners, as in the official code
             nn.Conv2d(channels // 2, 32, 3, padding=1),
             nn.ReLU(),
             nn.Conv2d(32, 1, 1),
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.head(x)
+        out: Tensor = self.head(x)
+        return out
 
 
 class DptHead(nn.Module):
@@ -137,6 +140,7 @@ class DptHead(nn.Module):
 
     Args:
         dim: width of the tokens.
+        max_depth_m: largest depth, to which :class:`OfficialHead` clamps.
         channels: of the decoder.
     """
 
@@ -160,12 +164,12 @@ class DptHead(nn.Module):
             list(self.fusion_blocks)[1:], (stages[2], stages[1], stages[0]), strict=True
         ):
             x = fusion(x, stage)
-        out = self.conv_depth(F.relu(self.project(x)))
+        out: Tensor = self.conv_depth(F.relu(self.project(x)))
         return torch.relu(out)[:, 0] + MIN_DEPTH_M
 
 
 class OfficialHead(nn.Module):
-    """A head under the name ``decode_head``, as the official files have it."""
+    """A head under the name ``decode_head``, as in the official files."""
 
     def __init__(self, head: LinearHead | DptHead) -> None:
         super().__init__()
@@ -176,11 +180,17 @@ class OfficialHead(nn.Module):
         return self.decode_head.layers
 
     def forward(self, tapped: Tapped) -> Tensor:
-        """Depth in metres between 1 mm and the head's largest."""
-        return self.decode_head(tapped).clamp(MIN_DEPTH_M, self.decode_head.max_depth_m)
+        """Depth in metres, clamped to 1 mm and the head's largest depth; the shape is that of the head."""
+        depth_m: Tensor = self.decode_head(tapped)
+        return depth_m.clamp(MIN_DEPTH_M, self.decode_head.max_depth_m)
 
 
 def linear_layers(shapes: dict[str, Shape], dim: int) -> int:
-    """How many blocks a linear head file reads; 4 unless its weight fits a single one."""
+    """Number of blocks that a linear head file reads: 4, unless its weight fits a single one.
+
+    Args:
+        shapes: of the file's tensors, by name.
+        dim: width of the tokens.
+    """
     weight = shapes.get("decode_head.conv_depth.weight", ())
     return 1 if len(weight) == 4 and weight[1] == 2 * dim else 4

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network this project grew from: three fully connected layers over all DINOv2 tokens.
+"""A baseline head: three fully connected layers over all DINOv2 tokens of an image.
 
-The image is squeezed to 224x224; the class token and the 256 patch tokens of a frozen
-ViT-S/14 (257x384 numbers) are min-max scaled with the ranges of the training set and go
-through layers of 1024, 1024 and 224x224 or 32x32, a Softplus after each.
+The image is squeezed to 224x224. The class token and the 256 patch tokens of a frozen ViT-S/14 (257x384
+values) are min-max scaled with the ranges of the training set and go through layers of 1024, 1024 and 224x224
+or 32x32, with a Softplus after each.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ FILES = tuple(f"dinov2_mlp_{side}.safetensors" for side in OUTPUTS)
 
 
 class _Scaler(nn.Module):
-    """Min-max scaling of every feature to 0..1 over the training set; beyond it outside."""
+    """Min-max scaling of every feature to 0..1 over the training set; other values may fall outside."""
 
     minimum: Tensor
     maximum: Tensor
@@ -56,12 +56,12 @@ class _Scaler(nn.Module):
 
 
 class MlpHead(nn.Module):
-    """All features of an image to a square depth map.
+    """Maps all features of an image to a square depth map.
 
     Args:
         output: side of the depth map.
-        features: numbers per image; the tokens of a ViT-S/14 at 224x224 by default.
-        hidden: width of the two inner layers.
+        features: values per image; by default the tokens of a ViT-S/14 at 224x224.
+        hidden: width of the two hidden layers.
     """
 
     def __init__(self, output: int, features: int = TOKENS * 384, hidden: int = HIDDEN) -> None:
@@ -73,23 +73,24 @@ class MlpHead(nn.Module):
         )
 
     def fit_scaler(self, features: Tensor) -> None:
-        """Take the ranges of the training set's ``features`` ``(N, F)``."""
+        """Set the ranges to those of the training set's ``features`` ``(N, F)``."""
         self.scaler.minimum.copy_(features.amin(dim=0))
         self.scaler.maximum.copy_(features.amax(dim=0))
 
     def forward(self, features: Tensor) -> Tensor:
-        """``(B, F)`` to depth ``(B, output, output)`` in metres, positive."""
-        x = self.scaler(features)
+        """Depth ``(B, output, output)`` in metres, positive, from features ``(B, F)``."""
+        x: Tensor = self.scaler(features)
         for layer in self.layers:
             x = F.softplus(layer(x))
         return x.view(len(x), self.output, self.output)
 
 
 def token_features(backbone: DinoV2, images: Tensor) -> Tensor:
-    """Class token, then patch tokens row by row, of the last block after the final norm.
+    """The class token, then the patch tokens row by row, of the last block after the final norm.
 
     Args:
-        images: ``(B, 3, 224, 224)``, normalised.
+        backbone: a ViT.
+        images: ``(B, 3, 224, 224)``, ImageNet-normalised.
 
     Returns:
         ``(B, 257 * dim)``.
@@ -100,17 +101,20 @@ def token_features(backbone: DinoV2, images: Tensor) -> Tensor:
 
 
 def at_size(depth_m: Tensor, height: int, width: int) -> NDArray[np.float32]:
-    """The first map of ``(B, S, S)`` enlarged to ``(height, width)``."""
+    """The first map of ``depth_m (B, S, S)``, resized bilinearly to ``(height, width)``."""
     full = F.interpolate(depth_m[:1, None], size=(height, width), mode="bilinear", align_corners=False)
     return np.asarray(full[0, 0].cpu().numpy(), dtype=np.float32)
 
 
 class Dinov2Mlp(NetworkDepth):
-    """A DINOv2 backbone and the fully connected head.
+    """A DINOv2 backbone and the fully connected head as a depth model.
 
     Args:
-        backbone, head: in eval mode.
-        card, weights, device: see :class:`NetworkDepth`.
+        backbone: a ViT-S/14 in eval mode.
+        head: in eval mode.
+        card: what the head was trained on and at which focal length.
+        weights: the files the two were read from.
+        device: where both run.
     """
 
     def __init__(
@@ -134,10 +138,11 @@ class Dinov2Mlp(NetworkDepth):
         Args:
             weights: the head's file; default: the one in the cache folder, 224 first.
             backbone: the ViT-S/14; default: the cached one.
+            device: where both run.
 
         Raises:
             WeightsError: a file is missing or another one; says which and where to put it.
-            ConfigError: the device is not there.
+            ConfigError: the device is not available.
         """
         check_device(device)
         path = find_checkpoint(NAME, FILES, weights)
@@ -159,7 +164,7 @@ class Dinov2Mlp(NetworkDepth):
 
 
 def model_card(about: Mapping[str, str]) -> ModelCard:
-    """The card of a head whose header says ``about``."""
+    """The card of a head, from the header ``about`` of its file."""
     focal_px = float(about["focal_px"]) if "focal_px" in about else None
     return ModelCard(
         NAME,
@@ -175,8 +180,13 @@ def save_mlp(path: Path, head: MlpHead, about: Mapping[str, str]) -> None:
     """Write ``head`` in half precision, atomically.
 
     Args:
-        about: kept in the header; ``trained_on``, ``licence``, and ``focal_px``, the focal
-            length of the training images squeezed to 224x224 (geometric mean of both axes).
+        path: a safetensors file; missing folders are made.
+        head: the head.
+        about: kept in the header: ``trained_on``, ``licence``, and ``focal_px``, the focal length of the
+            training images squeezed to 224x224 (geometric mean over both axes).
+
+    Raises:
+        OSError: the file cannot be written.
     """
     from safetensors.torch import save
 
@@ -190,11 +200,20 @@ def save_mlp(path: Path, head: MlpHead, about: Mapping[str, str]) -> None:
 def load_mlp(
     path: Path, device: str = "cpu", *, features: int = TOKENS * 384, hidden: int = HIDDEN
 ) -> tuple[MlpHead, dict[str, str]]:
-    """A head file in eval mode, and its header.
+    """Read a head file.
+
+    Args:
+        path: written by :func:`save_mlp`.
+        device: where the head is put.
+        features: values per image that the head must read.
+        hidden: width that its hidden layers must have.
+
+    Returns:
+        The head, frozen and in eval mode, and the header.
 
     Raises:
-        WeightsError: the file cannot be read, is of another format, or a tensor is
-            missing, extra or misshapen; names it.
+        WeightsError: the file cannot be read, is of another format, or a tensor is missing, extra or
+            misshapen; names it.
     """
     about = read_header(path)
     if about.get("format") != FORMAT:
@@ -210,7 +229,7 @@ def load_mlp(
 
 
 def read_header(path: Path) -> dict[str, str]:
-    """What :func:`save_mlp` was told about a head.
+    """The header of a head file; empty where the file is of another origin.
 
     Raises:
         WeightsError: the file cannot be read.
@@ -233,6 +252,9 @@ def _is_positive(text: str) -> bool:
 
 @register(NAME)
 def create(*, device: str = "cpu", seed: int = 0, weights: Path | None = None) -> Dinov2Mlp:
-    """The model with the cached backbone; it has nothing random."""
+    """The model with the cached backbone and the head in ``weights``, by default the cached one.
+
+    Nothing in it is random: ``seed`` has no effect.
+    """
     del seed
     return Dinov2Mlp.load(weights=weights, device=device)

@@ -50,14 +50,15 @@ _FILES = {
 
 
 class Dinov2OfficialDepth(NetworkDepth):
-    """A DINOv2 backbone and an official head.
+    """A DINOv2 backbone and an official head as a depth model.
 
     Args:
-        backbone: in eval mode; its final norm is taken out, for the heads were trained
-            without it.
+        backbone: in eval mode; its final norm is removed, because the heads were trained without it.
         head: in eval mode.
-        card, weights, device: see :class:`NetworkDepth`.
-        taps: blocks the head reads; default: those of a ViT-S.
+        card: what the head was trained on and at which size and focal length.
+        weights: the files the two were read from.
+        device: where both run.
+        taps: blocks that the head reads; default: those of a ViT-S.
     """
 
     def __init__(
@@ -92,10 +93,11 @@ class Dinov2OfficialDepth(NetworkDepth):
             data: ``"nyu"`` or ``"kitti"``.
             weights: the head's file; default: by its official name from the cache folder.
             backbone: the ViT-S/14; default: the cached one.
+            device: where both run.
 
         Raises:
             WeightsError: a file is missing or another one; says which and where to put it.
-            ConfigError: the device is not there.
+            ConfigError: the device is not available.
         """
         check_device(device)
         card = model_card(head, data)
@@ -129,14 +131,14 @@ class Dinov2OfficialDepth(NetworkDepth):
 
 
 def model_card(head: str, data: str) -> ModelCard:
-    """The card of an official head."""
+    """The card of the official head ``"linear"`` or ``"dpt"``, trained on ``"nyu"`` or ``"kitti"``."""
     training = _TRAININGS[data]
     name = f"dinov2-{head}" if data == "nyu" else f"dinov2-{head}-{data}"
     return ModelCard(name, DepthKind.METRIC, training.size, training.focal_px, LICENCE, training.data)
 
 
 def network_size(height: int, width: int, native: tuple[int, int]) -> tuple[int, int]:
-    """Rows and columns an image is resized to: the area of the training images, its own aspect."""
+    """Rows and columns that an image is resized to: the area of ``native``, the aspect of the image."""
     scale = math.sqrt(native[0] * native[1] / (height * width))
     return max(1, round(height * scale)), max(1, round(width * scale))
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The network of Depth Anything V2 (Yang et al. 2024): a DINOv2 ViT and a DPT decoder.
 
-DPT is "Vision Transformers for Dense Prediction" (Ranftl et al. 2021). Parameter names are
-those of the official files.
+DPT: Ranftl et al., "Vision Transformers for Dense Prediction", ICCV 2021. Parameter names are those of the
+official files.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ class DptShape:
     """Sizes of encoder and decoder.
 
     Attributes:
-        dim, depth, heads: of the ViT.
-        taps: the blocks whose tokens the decoder reads.
+        dim: width of the ViT.
+        depth: number of its blocks.
+        heads: number of its attention heads.
+        taps: blocks whose tokens the decoder reads.
         features: channels of the decoder.
-        stages: channels of the four resolutions before that, finest first.
-        grid: side of the square position embedding.
+        stages: channels of its four inputs, finest resolution first.
+        grid: tokens of the stored position embedding, along a side.
     """
 
     dim: int
@@ -43,7 +45,7 @@ LARGE = DptShape(1024, 24, 16, (4, 11, 17, 23), 256, (256, 512, 1024, 1024))
 
 
 class ResidualUnit(nn.Module):
-    """Two convolutions beside the identity (Ranftl et al. 2021), named as in the official files."""
+    """A residual unit of two convolutions (Ranftl et al. 2021), named as in the official files."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -51,12 +53,15 @@ class ResidualUnit(nn.Module):
         self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.conv2(F.relu(self.conv1(F.relu(x))))
+        residual: Tensor = self.conv2(F.relu(self.conv1(F.relu(x))))
+        return x + residual
 
 
 class _Fusion(nn.Module):
-    """Add a finer stage, refine, enlarge. The coarsest fusion has no stage to add, but the
-    official files carry its first residual unit all the same."""
+    """Add a finer stage, refine, upsample.
+
+    The coarsest fusion has no stage to add, though the official files have a first residual unit for it too.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -68,11 +73,12 @@ class _Fusion(nn.Module):
         if finer is not None:
             x = x + self.resConfUnit1(finer)
         x = F.interpolate(self.resConfUnit2(x), size=size, mode="bilinear", align_corners=True)
-        return self.out_conv(x)
+        out: Tensor = self.out_conv(x)
+        return out
 
 
 class _Scratch(nn.Module):
-    """Named as in MiDaS, whose decoder this is."""
+    """The convolutions and fusions of the decoder; the name is that of MiDaS."""
 
     def __init__(self, features: int, stages: tuple[int, int, int, int]) -> None:
         super().__init__()
@@ -91,8 +97,9 @@ class DptDecoder(nn.Module):
 
     Args:
         dim: width of the tokens.
-        features, stages: see :class:`DptShape`.
-        patch: pixels per token side.
+        features: channels of the decoder.
+        stages: channels of its four inputs, finest resolution first.
+        patch: pixels of the image per token, along a side.
     """
 
     def __init__(self, dim: int, features: int, stages: tuple[int, int, int, int], patch: int = 14) -> None:
@@ -110,7 +117,7 @@ class DptDecoder(nn.Module):
         self.scratch = _Scratch(features, stages)
 
     def forward(self, grids: list[Tensor]) -> Tensor:
-        """``(B, dim, h, w)`` of each tapped block, to ``(B, h * patch, w * patch)``."""
+        """Values ``(B, h * patch, w * patch)`` from the tokens ``(B, dim, h, w)`` of each tapped block."""
         rows, columns = grids[0].shape[-2:]
         stages = []
         for index, grid in enumerate(grids):
@@ -125,16 +132,17 @@ class DptDecoder(nn.Module):
         x = self.scratch.output_conv1(x)
         size = (rows * self.patch, columns * self.patch)
         x = F.interpolate(x, size=size, mode="bilinear", align_corners=True)
-        return self.scratch.output_conv2(x)[:, 0]
+        out: Tensor = self.scratch.output_conv2(x)
+        return out[:, 0]
 
 
 class DepthAnything(nn.Module):
-    """Encoder and decoder; what the output means is up to the weights.
+    """Encoder and decoder of Depth Anything V2; the weights decide what the output means.
 
     Args:
-        shape: sizes.
-        max_depth_m: None for a relative model, whose output is inverse depth up to scale
-            and shift; else the largest depth of a metric one.
+        shape: of encoder and decoder.
+        max_depth_m: largest depth of a metric model; None for a relative one, whose output is inverse depth
+            up to scale and shift.
     """
 
     def __init__(self, shape: DptShape, max_depth_m: float | None = None) -> None:
@@ -145,7 +153,10 @@ class DepthAnything(nn.Module):
         self.depth_head = DptDecoder(shape.dim, shape.features, shape.stages)
 
     def forward(self, image: Tensor) -> Tensor:
-        """``(B, 3, H, W)`` as :class:`DinoV2` takes it to ``(B, H, W)``: metres where
-        ``max_depth_m`` is set, else inverse depth up to scale and shift, not negative."""
+        """Depth in metres, or inverse depth up to scale and shift, ``(B, H, W)``, not negative.
+
+        Args:
+            image: ``(B, 3, H, W)``, ImageNet-normalised; H and W are multiples of 14.
+        """
         out = self.depth_head([grid for grid, _ in self.pretrained(image, self.taps)])
         return torch.relu(out) if self.max_depth_m is None else torch.sigmoid(out) * self.max_depth_m

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judge a depth model against sensor depth: accuracy, edges, and whether its uncertainty is true."""
+"""Evaluate a depth model against sensor depth: accuracy, edges and calibration of its uncertainty."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ Watch = Callable[[Frame, DepthPrediction], None]
 
 
 def judge_depth(model: DepthModel, frames: Iterable[Frame], *, watch: Watch | None = None) -> DepthJudgement:
-    """Predict every frame that has sensor depth and compare.
-
-    A model of any kind can be judged; one whose numbers are no metres has no figures "as
-    predicted". Frames are to come in order of time: the intervals suppose neighbours alike.
+    """Predict every frame that has sensor depth, and compare.
 
     Args:
-        watch: called with each frame compared and what was predicted for it.
+        model: of any kind; one that is not metric has no figures "as predicted".
+        frames: in order of time, because the confidence intervals take neighbouring frames as correlated.
+        watch: called with each frame that is compared, and its prediction.
 
     Raises:
         DatasetError: no frame has depth.

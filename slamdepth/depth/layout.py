@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names and shapes a weights file must have, the strict check of them, and its header."""
+"""Layouts of weights files: names and shapes of their tensors, the strict check of them, and the header."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _HEADER_KEY = "slamdepth"
 def dinov2_layout(dim: int = 384, depth: int = 12, patch: int = 14, grid: int = 37) -> dict[str, Shape]:
     """Tensor names and shapes of an official DINOv2 ViT file without registers.
 
-    The official file has one tensor more, ``mask_token``, which only its training used.
+    The official file also has a tensor ``mask_token``, which only training uses.
     """
     shapes: dict[str, Shape] = {
         "cls_token": (1, 1, dim),
@@ -48,17 +48,17 @@ def check_layout(
     *,
     ignored: tuple[str, ...] = (),
 ) -> None:
-    """Compare the tensors of a file with what the network needs.
+    """Check that a file has exactly the tensors that a network needs.
 
     Args:
-        found: name to shape, as read.
-        expected: name to shape, as needed.
+        found: shapes of the file's tensors, by name.
+        expected: shapes of the network's tensors, by name.
         origin: the file, named in errors.
         ignored: names that may be there and are not used.
 
     Raises:
-        WeightsError: a tensor is missing, extra or misshapen; names the first of each
-            kind and says how many there are.
+        WeightsError: a tensor is missing, extra or misshapen; names the first of each kind and says how many
+            there are.
     """
     missing = [name for name in expected if name not in found]
     extra = [name for name in found if name not in expected and name not in ignored]
@@ -78,13 +78,15 @@ def check_layout(
 
 
 def pack_about(about: Mapping[str, str]) -> dict[str, str]:
-    """What is to be said of a file as safetensors metadata, under one key: safetensors
-    writes several keys in random order, and the same training must give the same bytes."""
+    """A file's header ``about`` as safetensors metadata, under a single key.
+
+    safetensors writes several keys in random order, while the same training must give the same bytes.
+    """
     return {_HEADER_KEY: json.dumps(dict(about), sort_keys=True)}
 
 
 def unpack_about(metadata: Mapping[str, str] | None) -> dict[str, str]:
-    """What :func:`pack_about` packed; empty for a file of another origin."""
+    """The header of a file from its safetensors metadata; empty for a file of another origin."""
     try:
         about = json.loads((metadata or {}).get(_HEADER_KEY, "{}"))
     except ValueError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A depth model that looks at every image twice: as it is, and left and right exchanged."""
+"""A depth model that predicts every image twice: as taken, and flipped left to right."""
 
 from __future__ import annotations
 
@@ -16,29 +16,31 @@ from slamdepth.typing import Floats32
 
 
 class MirroredDepth:
-    """The mean of what ``model`` predicts of an image and of its mirror image, for twice the time (after
-    Godard et al., "Unsupervised Monocular Depth Estimation with Left-Right Consistency", CVPR 2017).
+    """The mean of a model's predictions for an image and for its mirror image, at twice the time.
 
-    The mean of metres and of their uncertainty is the geometric one, as errors of depth are relative. A
-    direction of gravity that the model found in the image is told for its mirror image.
+    After Godard et al., "Unsupervised Monocular Depth Estimation with Left-Right Consistency", CVPR 2017.
+    Metric depth and uncertainty are averaged geometrically, because errors of depth are relative. The
+    direction of gravity that the model estimates in the image is used for the mirror image too.
 
     Args:
-        model: any that predicts; kind and weights remain its own, and the name is ``mirrored:`` and its.
+        model: any that predicts. Kind and weights remain its own; the name is its own after ``mirrored:``.
 
     Raises:
-        ConfigError: ``model`` measures.
+        ConfigError: ``model`` is a sensor.
     """
 
     def __init__(self, model: DepthModel) -> None:
         if is_sensor(model):
-            raise ConfigError("depth model 'mirrored:sensor': a sensor's depth needs no mirror; use 'sensor'")
+            raise ConfigError(
+                f"depth model 'mirrored:{model.name}': a sensor's depth needs no mirror; use '{model.name}'"
+            )
         self.name, self.kind, self.weights = f"mirrored:{model.name}", model.kind, model.weights
         card = card_of(model)
         self.card = None if card is None else replace(card, name=self.name)
         self._model = model
 
     def predict(self, frame: Frame) -> DepthPrediction:
-        """Depth ``(H, W)`` of ``frame``; metres are unknown where both looks leave them so."""
+        """Depth ``(H, W)`` of ``frame``; metric depth is unknown where both predictions leave it unknown."""
         one = self._model.predict(frame)
         other = self._model.predict(mirror_image(frame, one.gravity))
         is_metric = self.kind is DepthKind.METRIC
@@ -50,10 +52,11 @@ class MirroredDepth:
 
 
 def mirror_image(frame: Frame, gravity: NDArray[np.float64] | None = None) -> Frame:
-    """``frame`` with left and right exchanged, without sensor depth.
+    """``frame`` flipped left to right, with its camera and gravity, without sensor depth.
 
     Args:
-        gravity: ``(3,)`` in the camera that took ``frame``; default: what ``frame`` says.
+        frame: as taken.
+        gravity: ``(3,)`` in the camera's frame (x right, y down, z forward); default: that of ``frame``.
     """
     gravity = frame.gravity if gravity is None else gravity
     return replace(
@@ -66,7 +69,7 @@ def mirror_image(frame: Frame, gravity: NDArray[np.float64] | None = None) -> Fr
 
 
 def _mean(one: Floats32, other: Floats32, *, is_geometric: bool) -> Floats32:
-    """Pixel by pixel; where metres of one are 0, unknown, the other counts alone."""
+    """Mean of two maps; of the geometric mean, where one is 0 (unknown) the other is taken alone."""
     if not is_geometric:
         return ((one + other) / 2).astype(np.float32)
     return np.where((one != 0) & (other != 0), np.sqrt(one * other), one + other).astype(np.float32)

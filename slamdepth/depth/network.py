@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every depth model that is one network and one weights file has in common."""
+"""Base class of depth models that are one network."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 
 
 class NetworkDepth(ABC):
-    """A :class:`~slamdepth.depth.base.DepthModel` around a network; subclasses say how it is run.
+    """A :class:`~slamdepth.depth.base.DepthModel` around a network; a subclass runs it in :meth:`infer`.
 
     Attributes:
-        name, kind: as its card says.
+        name: the registered name, from the card.
+        kind: what the values of its predictions mean, from the card.
         card: what it was trained on and at which size and focal length.
         weights: the files.
         device: where it runs.
@@ -32,18 +33,18 @@ class NetworkDepth(ABC):
 
     @abstractmethod
     def infer(self, image_rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], tuple[int, int]]:
-        """Run the network on ``(H, W, 3)``.
+        """Run the network on an RGB image ``(H, W, 3)``.
 
         Returns:
-            Values ``(H, W)`` at the image's own resolution as the network gives them, and
-            the rows and columns the image was resized to for it (without padding).
+            The network's values ``(H, W)`` at the image's own resolution, and the rows and columns that the
+            image was resized to (without padding).
         """
 
     def predict(self, frame: Frame) -> DepthPrediction:
         """Values of :attr:`kind` for every raw (not undistorted) pixel of ``frame``.
 
-        Metric depth learnt at a focal length f0 and seen at f is multiplied by f / f0, both
-        in pixels of the network's input.
+        Metric depth of a network trained at focal length f0 is multiplied by f / f0 for a camera of focal
+        length f, both in pixels of the network's input.
 
         Raises:
             CameraError: the image is too small or too narrow for the network.

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any depth network as an ONNX file, run by ONNX Runtime (an optional dependency).
 
-Nothing in an ONNX graph says what its numbers mean, so the file must: by the entry
-``slamdepth`` of its metadata, or by a text file beside it called ``FILE.onnx.json``, both a
-JSON object with
+Nothing in an ONNX graph says what its values mean, so its author must: in the entry ``slamdepth`` of the
+file's metadata, or in a text file next to it called ``FILE.onnx.json``. Both are a JSON object with
 
     kind         "metric depth", "affine depth" or "affine inverse depth"; needed
     input_size   [rows, columns] the network was trained on; needed where the graph leaves it open
@@ -43,7 +42,18 @@ Side = Annotated[int, Field(ge=1, le=1 << 14)]
 
 
 class OnnxAbout(BaseModel):
-    """What the author of an ONNX file says of it; see the module."""
+    """What the author of an ONNX file says of it, as JSON.
+
+    Attributes:
+        kind: what the values mean.
+        input_size: rows and columns that the network was trained with; needed where the graph leaves them
+            open.
+        multiple: where the graph leaves the size open, sides are multiples of this.
+        focal_px: focal length in pixels of the training images at that size; metric depth only.
+        mean, std: of the input in 0..1, for each of the channels R, G, B.
+        licence: of the weights.
+        trained_on: the data.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -58,14 +68,15 @@ class OnnxAbout(BaseModel):
 
 
 class OnnxDepth(NetworkDepth):
-    """A depth network in an ONNX file.
+    """A depth network in an ONNX file as a depth model.
 
     Args:
         session: an ONNX Runtime session.
         about: what the file says of itself.
-        size: rows and columns of the input; where ``is_fixed`` exactly these, else an
-            input of about their area in the image's aspect.
-        card, weights, device: see :class:`NetworkDepth`.
+        card: kind, input size, focal length and origin of the network.
+        weights: the file.
+        device: where it runs.
+        is_fixed: the input has exactly the size of the card; else about its area, in the image's aspect.
     """
 
     def __init__(
@@ -90,9 +101,9 @@ class OnnxDepth(NetworkDepth):
         """Open an ONNX file.
 
         Raises:
-            WeightsError: the file is missing or unreadable, does not say what its numbers
-                mean, or takes another input.
-            ConfigError: ONNX Runtime is not installed, or lacks the device.
+            WeightsError: the file is missing or unreadable, does not say what its values mean, or takes
+                another input.
+            ConfigError: ONNX Runtime is not installed, or has no such device.
         """
         if not path.is_file():
             raise WeightsError(f"{path}: no such ONNX file")
@@ -104,7 +115,11 @@ class OnnxDepth(NetworkDepth):
         return cls(session, about, card, (info,), device, is_fixed=is_fixed)
 
     def infer(self, image_rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], tuple[int, int]]:
-        """See :meth:`NetworkDepth.infer`.
+        """Run the network on an RGB image ``(H, W, 3)``.
+
+        Returns:
+            The network's values ``(H, W)`` at the image's own resolution, and the rows and columns that the
+            image was resized to.
 
         Raises:
             WeightsError: the graph does not run on the image, or its output is not one map.
@@ -124,7 +139,7 @@ class OnnxDepth(NetworkDepth):
         image = np.ascontiguousarray(image.transpose(2, 0, 1)[None])
         try:
             found = self._session.run([self._output], {self._input: image})
-        except Exception as error:  # ONNX Runtime's errors share no base class of their own
+        except Exception as error:  # ONNX Runtime's errors have no common base class
             raise WeightsError(
                 f"{self.name}: does not run on an image {image.shape}: {_first_line(error)}"
             ) from error
@@ -154,7 +169,7 @@ def _open(path: Path, device: str) -> Any:
     options.log_severity_level = 3
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=[provider])
-    except Exception as error:  # ONNX Runtime's errors share no base class of their own
+    except Exception as error:  # ONNX Runtime's errors have no common base class
         raise WeightsError(f"{path}: not a readable ONNX file: {_first_line(error)}") from error
 
 
@@ -163,13 +178,13 @@ def _first_line(error: Exception) -> str:
 
 
 def _about(path: Path, metadata: dict[str, str]) -> OnnxAbout:
-    beside = path.with_name(path.name + ".json")
-    origin = str(beside) if beside.is_file() else f"{path}, metadata '{METADATA_KEY}'"
+    sidecar = path.with_name(path.name + ".json")
+    origin = str(sidecar) if sidecar.is_file() else f"{path}, metadata '{METADATA_KEY}'"
     try:
-        text = beside.read_text(encoding="utf-8") if beside.is_file() else metadata.get(METADATA_KEY)
+        text = sidecar.read_text(encoding="utf-8") if sidecar.is_file() else metadata.get(METADATA_KEY)
         if text is None:
             raise WeightsError(
-                f"{path}: does not say what its numbers mean; write {beside} with at least "
+                f"{path}: does not say what its values mean; write {sidecar} with at least "
                 f'{{"kind": K}}, K being one of {_KINDS}'
             )
         return OnnxAbout.model_validate(json.loads(text))
@@ -182,7 +197,7 @@ def _about(path: Path, metadata: dict[str, str]) -> OnnxAbout:
 
 
 def _input_size(path: Path, session: Any, about: OnnxAbout) -> tuple[tuple[int, int], bool]:
-    """Rows and columns of the input, and whether the graph fixes them."""
+    """Rows and columns of the network's input, and whether the graph fixes them."""
     inputs = session.get_inputs()
     shape = list(inputs[0].shape) if inputs else []
     fixed = [size for size in zip(shape[:2], (1, 3), strict=False) if isinstance(size[0], int)]
@@ -200,6 +215,6 @@ def _input_size(path: Path, session: Any, about: OnnxAbout) -> tuple[tuple[int, 
 
 
 def create(path: str, *, device: str = "cpu", seed: int = 0) -> OnnxDepth:
-    """The model in the file at ``path``."""
+    """The model in the ONNX file at ``path``; nothing in it is random, so ``seed`` has no effect."""
     del seed
     return OnnxDepth.load(Path(path), device=device)

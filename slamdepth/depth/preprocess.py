@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a frame of any size to the network's input, and the focal length that goes with it."""
+"""From a frame of any size to the network's input, and its focal length there."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 PATCH = 14
 INPUT_PX = 196 * 266
-"""Pixels of the network input that the shipped head learnt from."""
+"""Pixels of the network's input that the shipped head was trained with."""
 
 CANONICAL_FOCAL_PX = 280.0
 """Focal length, in pixels of the network's input, at which log depth is predicted.
 
-Depth seen through a lens twice as long looks half as far, so the network predicts
-``z * CANONICAL_FOCAL_PX / f`` and ``f / CANONICAL_FOCAL_PX`` undoes it.
+Through a lens of twice the focal length things look half as far away, so the network predicts
+``z * CANONICAL_FOCAL_PX / f``, and a factor of ``f / CANONICAL_FOCAL_PX`` gives metres.
 """
 
 SMALLEST_SIDE = 28
@@ -31,7 +31,11 @@ LARGEST_ASPECT = 6.0
 
 
 def check_size(frame: Frame) -> None:
-    """Raise CameraError where the image of ``frame`` is too small or too narrow for a network."""
+    """Check that the image of ``frame`` is large and wide enough for a network.
+
+    Raises:
+        CameraError: a side is below 28 pixels, or the aspect above 6:1.
+    """
     height, width = frame.image_rgb.shape[:2]
     if min(height, width) < SMALLEST_SIDE or max(height, width) > LARGEST_ASPECT * min(height, width):
         raise CameraError(
@@ -41,8 +45,10 @@ def check_size(frame: Frame) -> None:
 
 
 def input_size(height: int, width: int, input_px: int = INPUT_PX) -> tuple[int, int]:
-    """Rows and columns of the network input: multiples of 14 of about ``input_px`` pixels
-    that keep the aspect of a ``height`` x ``width`` image."""
+    """Rows and columns of the network's input for a ``height`` x ``width`` image.
+
+    They are multiples of 14 that keep the aspect, with a product of about ``input_px``.
+    """
     scale = math.sqrt(input_px / (height * width))
     rows = max(1, round(height * scale / PATCH)) * PATCH
     columns = max(1, round(width * scale / PATCH)) * PATCH
@@ -50,13 +56,16 @@ def input_size(height: int, width: int, input_px: int = INPUT_PX) -> tuple[int, 
 
 
 def focal_px_at(camera: Camera, rows: int, columns: int) -> float:
-    """Focal length of ``camera``'s image resized to ``rows`` x ``columns``, pixels: of both axes the mean."""
+    """Focal length in pixels of ``camera``'s image resized to ``rows`` x ``columns``.
+
+    It is the geometric mean over both axes.
+    """
     scaled = camera.scaled(columns, rows)
     return math.sqrt(scaled.fx * scaled.fy)
 
 
 def resize_rgb(image_rgb: NDArray[np.uint8], rows: int, columns: int) -> NDArray[np.uint8]:
-    """``image_rgb (H, W, 3)`` at the network's size; area averaging where it shrinks."""
+    """``image_rgb (H, W, 3)`` resized to ``rows`` x ``columns``: by area where it shrinks, else bicubic."""
     import cv2
 
     if image_rgb.shape[:2] == (rows, columns):
@@ -67,7 +76,7 @@ def resize_rgb(image_rgb: NDArray[np.uint8], rows: int, columns: int) -> NDArray
 
 
 def normalised(images_rgb: NDArray[np.uint8], device: str) -> torch.Tensor:
-    """``(B, H, W, 3)`` uint8 as the ``(B, 3, H, W)`` tensor DINOv2 takes."""
+    """Images ``(B, H, W, 3)`` uint8 as a tensor ``(B, 3, H, W)``, ImageNet-normalised, on ``device``."""
     import torch
 
     from slamdepth.depth.dinov2 import IMAGENET_MEAN, IMAGENET_STD

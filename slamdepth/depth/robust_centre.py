@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The centre of numbers some of which are wrong."""
+"""A robust estimate of the centre of a sample with outliers."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ import numpy as np
 
 from slamdepth.typing import Floats
 
-_MOST = 1000
+_MAX_VALUES = 1000
 
 
 def robust_centre(values: Floats) -> float:
-    """The median of the means of all pairs (Hodges and Lehmann 1963).
+    """The Hodges-Lehmann estimate: the median of the means of all pairs (Hodges and Lehmann 1963).
 
-    It bears 29 % of outliers, and varies little more than the mean where errors are Gaussian, where the
-    median varies by a quarter more. Of many values only so many are taken, evenly.
+    It has a breakdown point of 29 %. For Gaussian errors its standard deviation is little above that of the
+    mean, while that of the median is a quarter above. Of more than 1,000 values, at most 1,000 evenly spaced
+    ones are used.
 
     Args:
         values: ``(N,)`` finite, at least one.
     """
-    some = values[:: -(-len(values) // _MOST)]
-    i, j = np.triu_indices(len(some))
-    return float(np.median((some[i] + some[j]) / 2.0))
+    sample = values[:: -(-len(values) // _MAX_VALUES)]
+    i, j = np.triu_indices(len(sample))
+    return float(np.median((sample[i] + sample[j]) / 2.0))

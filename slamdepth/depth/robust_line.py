@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A straight line through positive quantities whose errors grow with them."""
+"""A robust line fit for positive values with relative errors."""
 
 from __future__ import annotations
 
@@ -7,27 +7,29 @@ import numpy as np
 
 from slamdepth.typing import Floats
 
-_TUKEY = 4.685  # 95 % of least squares' efficiency where errors are Gaussian
-_SMALLEST_SPREAD = 1e-4
-_PAIRS, _JUDGED = 300, 1500
+_TUKEY = 4.685  # 95 % efficiency for Gaussian errors
+_MIN_SPREAD = 1e-4
+_PAIRS, _SCORED = 300, 1500
 
 
 def robust_line(
     x: Floats, y: Floats, start: tuple[float, float] | None = None, spread: float | None = None
 ) -> tuple[float, float, float]:
-    """``slope`` and ``intercept`` of ``y = slope * x + intercept``, robustly, by relative error.
+    """Fit ``y = slope * x + intercept`` robustly, by relative error.
 
-    Minimised are ``(y - m) / m`` with ``m`` the line: what a generalised linear model with a
-    Gamma distribution and the identity link weighs by (McCullagh and Nelder 1989, chapter
-    8), so that far points don't outweigh near ones. Dividing by ``y`` instead would pull
-    the line down wherever ``y`` is uncertain. The line through two points with the least
-    median residual (Rousseeuw 1984) starts it, then Tukey's biweight lets outliers go and
-    uses the rest fully: an MM-estimate (Yohai 1987). Least absolute deviations would not do
-    as a start: outliers far out in ``x`` turn them.
+    The residuals are ``(y - m) / m`` with ``m`` the line, as in a generalised linear model with a Gamma
+    distribution and the identity link (McCullagh and Nelder 1989, chapter 8), so that far points do not
+    outweigh near ones. Dividing by ``y`` instead would bias the line downwards wherever ``y`` is uncertain.
+    The fit is an MM-estimate (Yohai 1987): it starts from the line through two points with the least median
+    residual (Rousseeuw 1984) and continues with Tukey's biweight. Least absolute deviations would not do as
+    a start, because outliers far out in ``x`` tilt them.
 
     Args:
-        x: ``(N,)`` finite; y: ``(N,)`` positive.
-        start, spread: of an earlier fit of much the same points; spares the first stage.
+        x: ``(N,)`` finite.
+        y: ``(N,)`` positive.
+        start: slope and intercept of an earlier fit to much the same points; with ``spread`` it replaces the
+            first stage.
+        spread: standard deviation of the residuals of that fit.
 
     Returns:
         ``(slope, intercept, spread)``, the last a standard deviation of the residuals.
@@ -42,7 +44,7 @@ def robust_line(
     if start is None or spread is None:
         line = _least_median(design, y, lowest)
         residual, _ = _residual(design, y, line, lowest)
-        spread = max(1.4826 * float(np.median(np.abs(residual))), _SMALLEST_SPREAD)
+        spread = max(1.4826 * float(np.median(np.abs(residual))), _MIN_SPREAD)
     else:
         line = np.array(start)
     for _ in range(20):
@@ -55,9 +57,9 @@ def robust_line(
 
 
 def _least_median(design: Floats, y: Floats, lowest: float) -> Floats:
-    """The best of lines through random pairs, judged by the median over some points."""
+    """The line with the least median residual, of lines through random pairs of points."""
     rng = np.random.default_rng(0)
-    some = rng.permutation(len(y))[:_JUDGED]
+    scored = rng.permutation(len(y))[:_SCORED]
     a, b = rng.integers(0, len(y), (2, _PAIRS))
     run = design[b, 0] - design[a, 0]
     use = np.abs(run) > 0
@@ -66,14 +68,14 @@ def _least_median(design: Floats, y: Floats, lowest: float) -> Floats:
     lines = np.column_stack([slopes, y[a] - slopes * design[a, 0]])
     least = _solve(design, y, 1.0 / y**2)
     lines = np.vstack([least, lines])
-    cost = [np.median(np.abs(_residual(design[some], y[some], line, lowest)[0])) for line in lines]
+    cost = [np.median(np.abs(_residual(design[scored], y[scored], line, lowest)[0])) for line in lines]
     return np.asarray(lines[int(np.argmin(cost))], dtype=np.float64)
 
 
 def _residual(design: Floats, y: Floats, line: Floats, lowest: float) -> tuple[Floats, Floats]:
-    """Logs of ``y`` over the line, and the line's values, kept from crossing zero.
+    """Log ratios of ``y`` to the line, and the line's values, which are kept positive.
 
-    To first order they are the relative residuals, but too large and too small weigh alike.
+    To first order the log ratios are the relative residuals, but too large and too small weigh alike.
     """
     mean = np.maximum(design @ line, lowest)
     return np.log(y / mean), mean
@@ -81,4 +83,5 @@ def _residual(design: Floats, y: Floats, line: Floats, lowest: float) -> tuple[F
 
 def _solve(design: Floats, y: Floats, weight: Floats) -> Floats:
     weighted = design * weight[:, None]
-    return np.linalg.lstsq(design.T @ weighted, weighted.T @ y, rcond=None)[0]
+    line: Floats = np.linalg.lstsq(design.T @ weighted, weighted.T @ y, rcond=None)[0]
+    return line

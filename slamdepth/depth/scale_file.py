@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fitted depth scale as a small YAML file that says what it is of."""
+"""A fitted depth scale as a small YAML file that names its model, weights and sequence."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MEANING = {
 
 
 def write_scale(path: str | Path, fit: ScaleFit) -> None:
-    """Write ``fit`` so that :func:`read_scale` gives it back.
+    """Write ``fit`` as YAML, for :func:`read_scale`.
 
     Raises:
         OutputError: ``path`` cannot be written.
@@ -48,20 +48,20 @@ def write_scale(path: str | Path, fit: ScaleFit) -> None:
     head = (
         "# The scale of predicted depth, fitted to a sequence's depth sensor by 'slamdepth scale'.\n"
         f"# {_MEANING[fit.scale.domain]}\n"
-        "# scale_sigma_log: standard error of the natural log (with a shift: of the log of the middle\n"
-        "# depth), from resampling blocks of frames; it tells of this sequence, not of another one.\n"
-        "# frame_spread_log: how much the factor each frame would want varies (std of the natural log).\n"
+        "# scale_sigma_log: standard error of the natural log of the scale (with a shift: of the log of the\n"
+        "# median depth), by a bootstrap over blocks of frames; it holds for this sequence only.\n"
+        "# frame_spread_log: standard deviation over frames of the natural log of each frame's own factor.\n"
         "# Apply it: slamdepth run SEQ --depth-scale THIS_FILE, with the same model and weights.\n"
     )
     write_text(path, head + yaml.safe_dump(values, sort_keys=False))
 
 
 def read_scale(path: str | Path) -> ScaleFit:
-    """Read a file of :func:`write_scale`.
+    """Read a file that :func:`write_scale` wrote.
 
     Raises:
-        ConfigError: it is missing or no such file, or an entry is missing, unknown or
-            malformed; names it.
+        ConfigError: the file is missing or of another kind, or an entry is missing, unknown or malformed;
+            names it.
     """
     path = Path(path).expanduser()
     try:
@@ -74,15 +74,20 @@ def read_scale(path: str | Path) -> ScaleFit:
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(f"{path}: not valid YAML: {str(error).splitlines()[0]}") from error
     if not isinstance(values, dict) or values.get("format") != FORMAT:
-        raise ConfigError(f"{path}: is no depth scale; make one with 'slamdepth scale SEQ --output FILE'")
+        raise ConfigError(f"{path}: not a depth scale; make one with 'slamdepth scale SEQ --output FILE'")
     return _parsed(values, str(path))
 
 
 def check_same_model(fit: ScaleFit, model: DepthModel, origin: str) -> None:
-    """Refuse a scale that was fitted to another model's predictions.
+    """Check that a scale was fitted to the predictions of ``model``.
+
+    Args:
+        fit: the scale.
+        model: that it is to be applied to.
+        origin: of the scale, named in errors.
 
     Raises:
-        ConfigError: model or weights differ; names what.
+        ConfigError: model or weights differ; names the difference.
     """
     if (fit.model, fit.kind) != (model.name, model.kind):
         raise ConfigError(

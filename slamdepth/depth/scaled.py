@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A depth model whose numbers are multiplied, and shifted, as they come."""
+"""A depth model with a fixed scale, and shift, on its predictions."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from slamdepth.types import DepthKind, DepthPrediction, Frame
 
 
 class ScaledDepth:
-    """``model`` in metres; name and weights remain those of ``model``.
+    """A metric depth model made of another one; name and weights remain those of the other.
 
     Args:
-        model: any but the sensor.
-        scale: what makes metres of its numbers; a relative model needs one with a shift.
+        model: any but a sensor.
+        scale: maps its values to metres; that of a relative model needs a shift.
 
     Raises:
-        ConfigError: the scale cannot make this model metric.
+        ConfigError: ``model`` is a sensor, or the scale cannot make it metric.
     """
 
     kind = DepthKind.METRIC
@@ -36,20 +36,20 @@ class ScaledDepth:
             )
         if needs_shift(model.kind) and scale.shift == 0.0:
             raise ConfigError(
-                f"depth model '{model.name}' predicts {model.kind.value}: a factor alone makes no metres of "
-                "it; fit scale and shift with 'slamdepth scale SEQ --shift --output FILE'"
+                f"depth model '{model.name}' predicts {model.kind.value}: a scale alone does not make it "
+                "metric; fit scale and shift with 'slamdepth scale SEQ --shift --output FILE'"
             )
         self.name, self.weights = model.name, model.weights
         self.scale = scale
         self._model = model
 
     def predict(self, frame: Frame) -> DepthPrediction:
-        """Metres ``(H, W)`` and, where the model says how sure it is, that carried along."""
+        """Depth ``(H, W)`` in metres, with the uncertainty of the model's prediction, if any, propagated."""
         prediction = self._model.predict(frame)
         depth_m = self.scale.depth_m(prediction.values)
         sigma_log = prediction.sigma_log
         if sigma_log is not None and self.scale.shift != 0.0:
-            # d log(a v + b) = a v / (a v + b) d log v; the sign of a log does not matter
+            # d log(a v + b) = a v / (a v + b) d log v; the sign does not matter for a deviation.
             scaled = self.scale.scale * prediction.values
             line = np.where(depth_m > 0, scaled + np.float32(self.scale.shift), np.float32(1.0))
             sigma_log = (sigma_log * np.abs(scaled / line)).astype(np.float32)

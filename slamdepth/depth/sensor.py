@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor depth as a depth model: what a depth camera measured, passed through."""
+"""Sensor depth as a depth model: the measured depth of each frame, passed through."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from slamdepth.errors import DatasetError
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 
 KINECT_NOISE_PER_M = 0.0014
-"""Noise of a Kinect is about 1.4 mm x z^2, so 0.0014 x z of z (Khoshelham and Elberink 2012)."""
+"""Relative noise of a Kinect per metre of depth: about 1.4 mm * z^2 (Khoshelham and Elberink 2012)."""
 SIGMA_FLOOR = 0.002
-"""Of quantisation, registration and the lens, whatever the distance."""
+"""Relative noise at any depth, of quantisation, registration and the lens."""
 
 
 @register("sensor")
 class SensorDepth:
-    """Passes ``frame.depth_m`` through, with a Kinect's noise as its uncertainty."""
+    """Passes ``frame.depth_m`` through, with the noise of a Kinect as its uncertainty."""
 
     name = "sensor"
     kind = DepthKind.METRIC
@@ -28,7 +28,7 @@ class SensorDepth:
         del device, seed
 
     def predict(self, frame: Frame) -> DepthPrediction:
-        """The measured depth of ``frame``, non-finite and negative values made unknown.
+        """The measured depth of ``frame``, 0 (unknown) where it is not finite or negative.
 
         Raises:
             DatasetError: the frame has no depth.
@@ -37,7 +37,7 @@ class SensorDepth:
             raise DatasetError(
                 f"frame {frame.index} has no sensor depth; choose a predicted depth (--depth dinov2)"
             )
-        values = frame.depth_m.astype(np.float32, copy=False)  # shared, not kept twice
+        values = frame.depth_m.astype(np.float32, copy=False)  # shared with the frame, not copied
         unknown = ~(np.isfinite(values) & (values >= 0))
         if unknown.any():
             values = np.where(unknown, np.float32(0.0), values)

