@@ -223,3 +223,8 @@ def test_the_shipped_head_is_listed_with_its_origin() -> None:
     assert entry.size_bytes is not None
     assert entry.size_bytes < 8_000_000
     assert "TUM" in entry.trained_on  # says that no TUM frame was used
+
+
+def test_the_model_cards_name_the_sha256_of_their_files() -> None:
+    for file in (store.head_path(), store.head_path().with_name("orb_vocabulary.npz")):
+        assert sha256_of(file) in file.with_suffix(".md").read_text(encoding="utf-8")
