@@ -294,7 +294,7 @@ def test_an_image_of_another_size_is_named(tmp_path: Path) -> None:
 
 def test_a_reader_is_one_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known_readers()
-    monkeypatch.setattr(data, "_readers", dict(data._readers))
+    monkeypatch.setattr(data.READERS, "parts", dict(data.READERS.parts))
     pairs = open_place(make_place(tmp_path / "room"))
 
     @register_reader

@@ -103,7 +103,7 @@ def register_constant_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     def flat(**_: Any) -> ConstantDepth:
         return ConstantDepth()
 
-    monkeypatch.setitem(registry._factories, "constant", flat)
+    monkeypatch.setitem(registry.MODELS.parts, "constant", flat)
 
 
 class Run:

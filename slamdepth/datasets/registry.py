@@ -7,9 +7,7 @@ A layout is one file in ``slamdepth/datasets/readers/`` with a class under
 
 from __future__ import annotations
 
-import importlib
 import logging
-import pkgutil
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -17,6 +15,7 @@ from slamdepth.datasets.base import Dataset
 from slamdepth.datasets.camera_file import read_camera
 from slamdepth.datasets.video import VIDEO_ENDINGS
 from slamdepth.errors import DatasetError
+from slamdepth.registry import Registry
 from slamdepth.types import Camera
 
 _log = logging.getLogger(__name__)
@@ -48,16 +47,23 @@ class Reader(Protocol):
 
 
 _ReaderType = TypeVar("_ReaderType", bound=Reader)
-_readers: dict[str, Reader] = {}
+READERS: Registry[Reader] = Registry(
+    "dataset reader",
+    package="slamdepth.datasets.readers",
+    duplicate="two dataset readers are named '{name}'",
+    error=ValueError,
+)
 _last_reader: list[Reader] = []
 
 
 def register_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
-    """Class decorator that makes a :class:`Reader` known to :func:`open_dataset`."""
+    """Class decorator that makes a :class:`Reader` known to :func:`open_dataset`.
+
+    Raises:
+        ValueError: another reader has its name.
+    """
     reader = reader_type()
-    if reader.name in _readers:
-        raise ValueError(f"two dataset readers are named {reader.name!r}")
-    _readers[reader.name] = reader
+    READERS.add(reader.name, reader, reader_type)
     return reader_type
 
 
@@ -72,11 +78,7 @@ def register_last_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
 
 def known_readers() -> tuple[Reader, ...]:
     """The reader of every layout, in order of its name."""
-    from slamdepth.datasets import readers
-
-    for module in pkgutil.iter_modules(readers.__path__):
-        importlib.import_module(f"{readers.__name__}.{module.name}")
-    return tuple(_readers[name] for name in sorted(_readers))
+    return tuple(READERS.get(name) for name in READERS.names())
 
 
 def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dataset:

@@ -7,8 +7,6 @@ An extractor is one file in ``slamdepth/frontend/extractors/`` with a class unde
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +20,7 @@ from slamdepth.depth.weights import sha256_of
 from slamdepth.errors import ConfigError, TrackingError, WeightsError
 from slamdepth.frontend.matching import PixelGrid, match_all
 from slamdepth.frontend.metric import ORB, DescriptorMetric
+from slamdepth.registry import Registry
 from slamdepth.types import Camera, WeightsInfo
 from slamdepth.typing import Floats, Ints
 
@@ -151,22 +150,27 @@ class _Known(NamedTuple):
     needs_weights: bool
 
 
-_EXTRACTORS: dict[str, _Known] = {}
+EXTRACTORS: Registry[_Known] = Registry(
+    "feature",
+    package="slamdepth.frontend.extractors",
+    unknown="features.name: no feature is called '{name}'; known: {choices}",
+)
 
 
 def register_extractor(
     name: str, *, needs_weights: bool = False
 ) -> Callable[[ExtractorFactory], ExtractorFactory]:
-    """Make an extractor available as ``features.name`` in the settings.
+    """Class decorator: make an extractor available as ``features.name`` in the settings.
 
     Args:
         needs_weights: it is a network, whose file ``features.weights`` names.
+
+    Raises:
+        ConfigError: another feature has the name.
     """
 
     def register(factory: ExtractorFactory) -> ExtractorFactory:
-        if name in _EXTRACTORS:
-            raise ConfigError(f"two features are called '{name}'")
-        _EXTRACTORS[name] = _Known(factory, needs_weights)
+        EXTRACTORS.add(name, _Known(factory, needs_weights), factory)
         return factory
 
     return register
@@ -174,11 +178,7 @@ def register_extractor(
 
 def feature_names() -> list[str]:
     """Every name :func:`create_extractor` knows, in order."""
-    from slamdepth.frontend import extractors
-
-    for module in pkgutil.iter_modules(extractors.__path__):
-        importlib.import_module(f"{extractors.__name__}.{module.name}")
-    return sorted(_EXTRACTORS)
+    return EXTRACTORS.names()
 
 
 def needs_weights(name: str) -> bool:
@@ -187,14 +187,7 @@ def needs_weights(name: str) -> bool:
     Raises:
         ConfigError: no extractor has that name; lists those that exist.
     """
-    return _looked_up(name).needs_weights
-
-
-def _looked_up(name: str) -> _Known:
-    names = feature_names()
-    if name not in names:
-        raise ConfigError(f"features.name: no feature is called '{name}'; known: {', '.join(names)}")
-    return _EXTRACTORS[name]
+    return EXTRACTORS.get(name).needs_weights
 
 
 def create_extractor(config: FeatureConfig) -> FeatureExtractor:
@@ -205,7 +198,7 @@ def create_extractor(config: FeatureConfig) -> FeatureExtractor:
             OpenCV lacks it, or it needs a weights file or takes none.
         WeightsError: its weights are missing or of another layout.
     """
-    known = _looked_up(config.name)
+    known = EXTRACTORS.get(config.name)
     files = [name for name in (config.weights, config.matcher) if name is not None]
     if known.needs_weights and config.weights is None:
         raise ConfigError(

@@ -9,15 +9,14 @@ the sequence layouts of ``slamdepth.datasets``, which this room does not know, g
 from __future__ import annotations
 
 import hashlib
-import importlib
 import logging
 import os
-import pkgutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from slamdepth.errors import DatasetError
+from slamdepth.registry import Registry
 from slamdepth.types import Camera, Frame
 
 if TYPE_CHECKING:
@@ -92,25 +91,28 @@ class PlaceReader(Protocol):
 
 
 _ReaderType = TypeVar("_ReaderType", bound=PlaceReader)
-_readers: dict[str, PlaceReader] = {}
+READERS: Registry[PlaceReader] = Registry(
+    "reader of training data",
+    package="slamdepth.training.readers",
+    duplicate="two readers of training data are named '{name}'",
+    error=ValueError,
+)
 
 
 def register_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
-    """Class decorator that makes a :class:`PlaceReader` known by its name."""
+    """Class decorator that makes a :class:`PlaceReader` known by its name.
+
+    Raises:
+        ValueError: another reader has its name.
+    """
     reader = reader_type()
-    if reader.name in _readers:
-        raise ValueError(f"two readers of training data are named {reader.name!r}")
-    _readers[reader.name] = reader
+    READERS.add(reader.name, reader, reader_type)
     return reader_type
 
 
 def known_readers() -> dict[str, PlaceReader]:
     """The readers of this room, by name."""
-    from slamdepth.training import readers
-
-    for module in pkgutil.iter_modules(readers.__path__):
-        importlib.import_module(f"{readers.__name__}.{module.name}")
-    return dict(sorted(_readers.items()))
+    return {name: READERS.get(name) for name in READERS.names()}
 
 
 def open_place(
