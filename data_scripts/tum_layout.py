@@ -13,7 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slamdepth.datasets import CAMERA_FILE, write_camera
+from slamdepth.calibration import CAMERA_FILE
+from slamdepth.datasets import write_camera
 from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.io import format_timestamp, read_depth_raw, write_text, write_tum_trajectory
 from slamdepth.types import Camera, Trajectory

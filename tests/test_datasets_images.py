@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from sequences import CAMERA, depth_raw, image_rgb, make_sevenscenes, make_tum, write_image
 from tracking_scene import register_constant_depth
 
-from slamdepth.datasets import Dataset, known_readers, open_dataset, read_camera, write_camera
+from slamdepth.datasets import Dataset, known_readers, open_dataset, write_camera
 from slamdepth.datasets.readers.images import FolderSequence, ImagesReader
 from slamdepth.datasets.resizing import LONGEST_SIDE_PX, reduced_camera
 from slamdepth.errors import CameraError, DatasetError, InputError
@@ -158,7 +158,7 @@ def test_a_folder_of_images_is_run_like_its_sequence(
     plain.mkdir()
     for number, path in enumerate(sorted((tiny_room / "rgb").iterdir())):
         (plain / f"frame-{number + 1}.png").symlink_to(path)
-    write_camera(tmp_path / "own.yaml", read_camera(tiny_room / "camera.yaml"))
+    write_camera(tmp_path / "own.yaml", Camera.from_file(tiny_room / "camera.yaml"))
     done = call("run", plain, "--depth", "constant", "--no-mesh", "-o", tmp_path / "refused")
     assert done.returncode == 2
     assert done.stderr.count("error: ") == 1

@@ -12,7 +12,7 @@ import pytest
 from command_line import call
 from tracking_scene import register_constant_depth
 
-from slamdepth.datasets import Dataset, open_dataset, read_camera, write_camera
+from slamdepth.datasets import Dataset, open_dataset, write_camera
 from slamdepth.datasets.readers.video import VideoSequence
 from slamdepth.datasets.video import VideoFile
 from slamdepth.errors import CameraError, DatasetError
@@ -148,7 +148,7 @@ def test_a_video_is_run_like_its_frames(
 
     register_constant_depth(monkeypatch)
     images = [cv2.imread(str(path)) for path in sorted((tiny_room / "rgb").iterdir())]
-    camera = read_camera(tiny_room / "camera.yaml")
+    camera = Camera.from_file(tiny_room / "camera.yaml")
     video = film(tmp_path / "room.avi", images, camera.fps)
     write_camera(tmp_path / "phone.yaml", camera)
     turns = []

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera
+from slamdepth.calibration import CAMERA_FILE
 from slamdepth.types import Camera
 
 GUESSED_VIEW_DEG = 60.0
@@ -51,9 +51,9 @@ def find_camera_file(folder: Path, camera_file: Path | None) -> tuple[Camera, st
         CameraError: the file cannot be read or is malformed.
     """
     if camera_file is not None:
-        return read_camera(camera_file.expanduser()), f"the file {camera_file.name}"
+        return Camera.from_file(camera_file.expanduser()), f"the file {camera_file.name}"
     beside = folder / CAMERA_FILE
-    return (read_camera(beside), f"{CAMERA_FILE} beside the images") if beside.is_file() else None
+    return (Camera.from_file(beside), f"{CAMERA_FILE} beside the images") if beside.is_file() else None
 
 
 def intrinsics_of(width: int, height: int, focal_35mm: float | None = None) -> Intrinsics:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from slamdepth.datasets.base import Dataset
-from slamdepth.datasets.camera_file import read_camera
 from slamdepth.datasets.video import VIDEO_ENDINGS
 from slamdepth.errors import DatasetError
 from slamdepth.registry import Registry
@@ -98,8 +97,9 @@ def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dat
         if not path.exists():
             what = "video file" if path.suffix.lower() in VIDEO_ENDINGS else "folder"
             raise DatasetError(f"{path}: no such {what}")
-        camera_notes: list[str] = []
-        camera = None if camera_file is None else read_camera(Path(camera_file).expanduser(), camera_notes)
+        camera, camera_notes = None, list[str]()
+        if camera_file is not None:
+            camera = Camera.from_file(Path(camera_file).expanduser(), camera_notes)
         readers = (*known_readers(), *_last_reader)
         for reader in readers:
             if reader.matches(path):

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files in and out: TUM trajectories, images, point clouds, text and JSON."""
+"""Files in and out: cameras, TUM trajectories, images, point clouds, text and JSON."""
 
 from __future__ import annotations
 
+from slamdepth.io.camera import write_camera
 from slamdepth.io.images import (
     read_depth_m,
     read_depth_raw,
@@ -31,6 +32,7 @@ __all__ = [
     "read_lines",
     "read_tum_trajectory",
     "replacing",
+    "write_camera",
     "write_depth_mm",
     "write_json",
     "write_npy",

@@ -11,9 +11,9 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from slamdepth.datasets.camera_file import CAMERA_FILE, write_camera
+from slamdepth.calibration import CAMERA_FILE
 from slamdepth.errors import ConfigError, OutputError
-from slamdepth.io import replacing, write_text, write_tum_trajectory
+from slamdepth.io import replacing, write_camera, write_text, write_tum_trajectory
 from slamdepth.types import Camera, Frame, Trajectory
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera, what_to_write
+from slamdepth.calibration import CAMERA_FILE, what_to_write
 from slamdepth.datasets.image_files import has_images, list_images
 from slamdepth.datasets.registry import register_last_reader
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
@@ -42,7 +42,7 @@ class ImagesReader:
         _check_no_depth(sample_path)
         camera_path = path / CAMERA_FILE
         if camera is None and camera_path.exists():
-            camera = read_camera(camera_path, notes)
+            camera = Camera.from_file(camera_path, notes)
         if camera is None:
             raise CameraError(
                 f"{path}: the intrinsics of these images are unknown: write {camera_path} or pass --camera "

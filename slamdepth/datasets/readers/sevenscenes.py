@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera
+from slamdepth.calibration import CAMERA_FILE
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import ImageSequence, check_size, first_image
 from slamdepth.errors import DatasetError
@@ -144,7 +144,7 @@ def _read_poses(
 
 def _find_camera(path: Path, camera: Camera | None, notes: list[str]) -> Camera:
     if camera is None and (path / CAMERA_FILE).exists():
-        camera = read_camera(path / CAMERA_FILE, notes)
+        camera = Camera.from_file(path / CAMERA_FILE, notes)
     if camera is None:
         notes.append(
             "intrinsics 585 585 320 240 known by the 7-Scenes layout; depth was never calibrated to colour"

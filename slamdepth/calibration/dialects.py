@@ -15,7 +15,6 @@ from typing import Any
 import yaml
 
 from slamdepth.errors import CameraError
-from slamdepth.io import parse_float
 
 _NAMES = {
     "matrix": ("cameramatrix", "k"),
@@ -148,6 +147,8 @@ def _number(path: Path, key: Any, value: Any) -> float:
     try:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise ValueError
-        return parse_float(value) if isinstance(value, str) else float(value)  # '1e-05' is a text to YAML 1.1
+        if isinstance(value, str) and "_" in value:  # Python's 1_000, which no calibration means
+            raise ValueError
+        return float(value)  # also of text: '1e-05' is one to YAML 1.1
     except (ValueError, OverflowError) as error:
         raise CameraError(f"{path}: key {key!r} must hold numbers, found {str(value)[:40]!r}") from error

@@ -14,7 +14,7 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from slamdepth.datasets import open_dataset, read_camera
+from slamdepth.datasets import open_dataset
 from slamdepth.errors import CameraError
 from slamdepth.types import Camera
 
@@ -69,7 +69,7 @@ projection_matrix:
 
 def read(folder: Path, text: str) -> Camera:
     (folder / "own.yaml").write_text(text)
-    return read_camera(folder / "own.yaml", [])
+    return Camera.from_file(folder / "own.yaml", [])
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_what_was_read_is_noted(tmp_path: Path, tiny_room: Path, caplog: pytest.
     )
     assert open_dataset(tiny_room, path).notes[0] == said
     with caplog.at_level(logging.WARNING, logger="slamdepth"):
-        read_camera(path)
+        Camera.from_file(path)
     assert said in caplog.text
 
 
@@ -114,7 +114,7 @@ def test_what_opencv_writes_comes_back(
     storage.write("camera_matrix", np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]]))
     storage.write("distortion_coefficients", np.array([bent or [0.0]]))
     storage.release()
-    camera = read_camera(path, [])
+    camera = Camera.from_file(path, [])
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((*focal, *centre), rel=1e-14)
     assert camera.distortion == pytest.approx((*bent, *[0.0] * (5 - len(bent))), rel=1e-14, abs=1e-300)
 
@@ -208,5 +208,5 @@ matrices = st.fixed_dictionaries({}, optional={"rows": anything, "cols": anythin
 def test_garbage_in_the_right_keys_is_a_camera_error(tmp_path: Path, values: dict[str, Any]) -> None:
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(values, allow_unicode=True), encoding="utf-8")
     with pytest.raises(CameraError) as caught:
-        read_camera(tmp_path / "own.yaml", [])
+        Camera.from_file(tmp_path / "own.yaml", [])
     assert "\n" not in str(caught.value)
