@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slamdepth.datasets.camera_file import what_to_write
+from slamdepth.calibration import what_to_write
+from slamdepth.datasets.base import Dataset
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
 from slamdepth.datasets.sequence import check_size
@@ -43,7 +44,7 @@ class VideoReader:
         return VideoSequence(video, camera)
 
 
-class VideoSequence:
+class VideoSequence(Dataset):
     """The :class:`~slamdepth.datasets.base.Dataset` of a video.
 
     Frames are decoded in order, so reading forwards is fast; a step back starts from the first frame again.
