@@ -70,7 +70,7 @@ class Features:
         sigma_px: ``(N,)`` float64 standard deviation of ``px``.
         descriptors: ``(N, D)``, of the width and type that ``metric`` is for.
         metric: how descriptors are compared.
-        orb_words: finds ORB descriptors ``(M, 32)`` of the same image, for place
+        orb_descriptors: gives ORB descriptors ``(M, 32)`` of the same image, for place
             recognition; None where ``descriptors`` are ORB's.
         matcher: matches whole images; None compares descriptors one by one.
 
@@ -84,7 +84,7 @@ class Features:
     sigma_px: Floats
     descriptors: NDArray[Any]
     metric: DescriptorMetric = ORB
-    orb_words: Callable[[], NDArray[np.uint8]] | None = None
+    orb_descriptors: Callable[[], NDArray[np.uint8]] | None = None
     matcher: ImageMatcher | None = None
 
     def __post_init__(self) -> None:
@@ -106,7 +106,7 @@ class Features:
     @property
     def place_descriptors(self) -> NDArray[np.uint8]:
         """ORB descriptors ``(M, 32)`` of the image: what places are recognised by."""
-        return self.descriptors if self.orb_words is None else self.orb_words()
+        return self.descriptors if self.orb_descriptors is None else self.orb_descriptors()
 
     def match(self, other: Features, among: Ints, *, ratio: float) -> tuple[Ints, Ints]:
         """Match the keypoints ``among`` of this image with all of another, wherever they are.
@@ -216,34 +216,3 @@ def feature_weights(config: FeatureConfig) -> tuple[WeightsInfo, ...]:
     """The files of networks that ``config`` names; what they were trained on they do not say."""
     files = [Path(name).expanduser() for name in (config.weights, config.matcher) if name is not None]
     return tuple(WeightsInfo(file.stem, sha256_of(file), "unknown", "unknown") for file in files)
-
-
-def spread(px: Floats, response: Floats, count: int, cell_px: float) -> Ints:
-    """Choose ``count`` keypoints evenly: every cell's best first, then every cell's second.
-
-    Args:
-        px: ``(N, 2)`` pixels.
-        response: ``(N,)`` strength.
-        count: how many to keep.
-        cell_px: edge of a cell in pixels.
-
-    Returns:
-        Indices, at most ``count``, in ascending order.
-    """
-    if len(px) <= count:
-        return np.arange(len(px))
-    cells = np.floor(px / cell_px).astype(np.int64)
-    cell = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
-    order = np.lexsort((-response, cell))
-    sorted_cell = cell[order]
-    starts = np.flatnonzero(np.r_[True, sorted_cell[1:] != sorted_cell[:-1]])
-    rank = np.arange(len(px)) - np.repeat(starts, np.diff(np.r_[starts, len(px)]))
-    rank_of = np.empty(len(px), dtype=np.int64)
-    rank_of[order] = rank
-    chosen = np.lexsort((-response, rank_of))[:count]
-    return np.sort(chosen)
-
-
-def cell_edge_px(gray: NDArray[np.uint8], count: int) -> float:
-    """Edge of a cell for :func:`spread`: about two keypoints a cell."""
-    return float(np.sqrt(gray.shape[0] * gray.shape[1] / count) * 1.5)

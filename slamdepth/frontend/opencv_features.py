@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slamdepth.errors import ConfigError
-from slamdepth.frontend.features import Features, ScaleLevels, cell_edge_px, spread
+from slamdepth.frontend.features import Features, ScaleLevels
+from slamdepth.frontend.keypoints import cell_edge_px, pixels, responses, spread
 from slamdepth.frontend.metric import DescriptorMetric
-from slamdepth.frontend.orb_descriptors import OrbWords
+from slamdepth.frontend.orb_descriptors import OrbDescriptors
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
@@ -62,7 +62,7 @@ class OpenCvExtractor:
             sigma_px=self.levels.sigma_px(octave),
             descriptors=self.descriptors(described[kept]) if len(kept) else self._metric.empty(),
             metric=self._metric,
-            orb_words=OrbWords(gray, self._count),
+            orb_descriptors=OrbDescriptors(gray, self._count),
         )
 
     def descriptors(self, described: NDArray[Any]) -> NDArray[Any]:
@@ -86,20 +86,6 @@ def opencv_class(name: str, feature: str) -> Any:
         f"feature '{feature}' is not in this OpenCV ({cv2.__version__}): install "
         "opencv-contrib-python-headless in place of opencv-python-headless"
     )
-
-
-def pixels(keypoints: Sequence[Any]) -> Floats:
-    """Where OpenCV's keypoints are, ``(N, 2)``."""
-    import cv2
-
-    if len(keypoints) == 0:
-        return np.zeros((0, 2))
-    return np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
-
-
-def responses(keypoints: Sequence[Any]) -> Floats:
-    """How strong OpenCV's keypoints are, ``(N,)``."""
-    return np.array([k.response for k in keypoints], dtype=np.float64)
 
 
 def _first_of_each(px: Floats) -> NDArray[np.int64]:

@@ -11,11 +11,11 @@ import numpy as np
 
 from slamdepth.config import FeatureConfig
 from slamdepth.errors import WeightsError
-from slamdepth.frontend.features import Features, ScaleLevels, cell_edge_px, register_extractor, spread
+from slamdepth.frontend.features import Features, ScaleLevels, register_extractor
+from slamdepth.frontend.keypoints import cell_edge_px, pixels, responses, spread
 from slamdepth.frontend.metric import UnitL2
 from slamdepth.frontend.networks import LightGlue, clear_errors, network_class
-from slamdepth.frontend.opencv_features import pixels, responses
-from slamdepth.frontend.orb_descriptors import OrbWords
+from slamdepth.frontend.orb_descriptors import OrbDescriptors
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
@@ -71,7 +71,7 @@ class AlikedExtractor:
             sigma_px=self.levels.sigma_px(octave),
             descriptors=described[at],
             metric=_METRIC,
-            orb_words=OrbWords(gray, self._count),
+            orb_descriptors=OrbDescriptors(gray, self._count),
             matcher=matcher,
         )
 
