@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.errors import DatasetError, InputError, OutputError
-from slamdepth.loops.vocabulary import DESCRIPTOR_BYTES, Vocabulary, check_descriptors, nearest
+from slamdepth.frontend.metric import hamming, hamming_nearest
+from slamdepth.loops.vocabulary import DESCRIPTOR_BYTES, Vocabulary, check_descriptors
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,10 +51,10 @@ def k_majority(
     if len(distinct) < count:
         raise ValueError(f"{count} clusters need as many distinct descriptors, got {len(distinct)}")
     centres = distinct[_spread_seeds(distinct, count, rng)]
-    cluster = nearest(descriptors, centres)
+    cluster = hamming_nearest(descriptors, centres)
     for _ in range(iterations):
         centres = _majority(descriptors, cluster, centres)
-        moved = nearest(descriptors, centres)
+        moved = hamming_nearest(descriptors, centres)
         if np.array_equal(moved, cluster):
             break
         cluster = moved
@@ -120,11 +121,11 @@ def read_descriptors(folder: Path, exclude: Sequence[str], features: int) -> lis
 def _spread_seeds(distinct: Descriptors, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
     """k-means++ seeding in Hamming space, on a sample that bounds its cost."""
     sample = np.sort(rng.choice(len(distinct), size=min(len(distinct), 20000), replace=False))
-    wide = np.ascontiguousarray(distinct[sample]).view(np.uint64)
+    candidates = distinct[sample]
     chosen = [int(rng.integers(len(sample)))]
     squared = np.full(len(sample), np.inf)
     while len(chosen) < count:
-        to_last = np.bitwise_count(wide ^ wide[chosen[-1]]).sum(axis=1, dtype=np.float64)
+        to_last = hamming(candidates, candidates[chosen[-1]]).astype(np.float64)
         squared = np.minimum(squared, to_last**2)
         chosen.append(int(rng.choice(len(sample), p=squared / squared.sum())))
     return sample[chosen]

@@ -17,6 +17,7 @@ from slamdepth.geometry import (
     orthonormalised,
     project,
     quat_xyzw_to_rotation,
+    reprojection_errors,
     rotation_angle_rad,
     rotation_to_quat_xyzw,
     se3_exp,
@@ -111,6 +112,15 @@ def test_backproject_undoes_project(seed: int) -> None:
     again, z = project(CAMERA, backproject(CAMERA, px, depth))
     np.testing.assert_allclose(again, px, atol=1e-9)
     np.testing.assert_allclose(z, depth)
+
+
+def test_reprojection_errors_are_projections_less_measurements() -> None:
+    rng = np.random.default_rng(0)
+    points_c, px = rng.uniform((-1, -1, 0.5), (1, 1, 4), (20, 3)), rng.uniform(0, 480, (20, 2))
+    errors = reprojection_errors(CAMERA, points_c.T, px.T, 0.1)
+    np.testing.assert_allclose(errors.T, project(CAMERA, points_c)[0] - px, atol=1e-9)
+    behind = reprojection_errors(CAMERA, np.array([[0.1], [0.0], [-2.0]]), np.zeros((2, 1)), 0.1)
+    np.testing.assert_allclose(behind[:, 0], [CAMERA.cx + CAMERA.fx, CAMERA.cy])
 
 
 def test_the_optical_axis_meets_the_principal_point() -> None:

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from data_scripts.train_vocabulary import k_majority, main, train_vocabulary
 from slamdepth.errors import DatasetError, OutputError, TrackingError, WeightsError
+from slamdepth.frontend.metric import hamming_nearest
 from slamdepth.geometry import quat_xyzw_to_rotation, rotation_angle_rad
 from slamdepth.loops.places import PlaceRecogniser
-from slamdepth.loops.vocabulary import Vocabulary, load_vocabulary, nearest
+from slamdepth.loops.vocabulary import Vocabulary, load_vocabulary
 
 
 def random_descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -40,13 +41,16 @@ def test_nearest_is_the_nearest_in_hamming_distance(count: int, centres: int, se
     a, b = random_descriptors(rng, count), random_descriptors(rng, centres)
     b[-1] = b[0]  # a tie goes to the first
     bits = np.unpackbits(a, axis=1)[:, None] != np.unpackbits(b, axis=1)[None]
-    np.testing.assert_array_equal(nearest(a, b), bits.sum(axis=2).argmin(axis=1))
+    np.testing.assert_array_equal(hamming_nearest(a, b), bits.sum(axis=2).argmin(axis=1))
 
 
 def test_all_256_bits_different_is_far_and_not_near() -> None:
     zeros, ones = np.zeros((1, 32), dtype=np.uint8), np.full((1, 32), 255, dtype=np.uint8)
     assert (
-        nearest(zeros, np.concatenate([ones, with_flipped_bits(zeros, 200, np.random.default_rng(0))])) == 1
+        hamming_nearest(
+            zeros, np.concatenate([ones, with_flipped_bits(zeros, 200, np.random.default_rng(0))])
+        )
+        == 1
     )
 
 

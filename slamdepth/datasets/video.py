@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.errors import DatasetError, ImageDecodeError
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -59,7 +60,7 @@ class VideoFile:
         self.fps = fps
         self.frames_named = round(named) if 0 < named < 1e9 else 0
 
-    def timestamps_s(self) -> NDArray[np.float64]:
+    def timestamps_s(self) -> Floats:
         """``(N,)`` times of all frames in seconds from the first; the video is decoded once for it.
 
         A phone's frames do not come at equal intervals, so each says its own time. Where times do not
@@ -73,11 +74,11 @@ class VideoFile:
                 times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
         finally:
             capture.release()
-        told = np.array(times_s)
-        if len(told) > 1 and not (np.diff(told) > 0).all():
+        found: Floats = np.array(times_s)
+        if len(found) > 1 and not (np.diff(found) > 0).all():
             self.notes.append(f"the times of the video's frames do not increase; {self.fps:g} Hz is assumed")
-            return np.arange(len(told)) / self.fps
-        return told - told[0]
+            return np.asarray(np.arange(len(found)) / self.fps)
+        return np.asarray(found - found[0])
 
     def frames(self, stride: int = 1) -> Iterator[tuple[int, Callable[[], NDArray[np.uint8]]]]:
         """Every ``stride``-th frame: its number from 0, and a function that decodes it.

@@ -93,9 +93,9 @@ class CloudOdometry:
         within = (range_m > self.config.min_m) & (range_m < self.config.max_m)
         if np.count_nonzero(within) < self.config.min_points:
             return None
-        pose = self._step(cloud_c[within])
+        pose: Floats = self._step(cloud_c[within]).copy()
         self._clouds += 1
-        return pose.copy()
+        return pose
 
     def _step(self, cloud_c: Floats) -> Floats:
         """KISS-ICP's own step, with the polish between its registration and its map."""

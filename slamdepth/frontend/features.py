@@ -44,7 +44,8 @@ class ScaleLevels:
 
     def of(self, size: Floats) -> Ints:
         """Level of keypoints ``(N,)`` that are so many times as large as the finest; may be past the last."""
-        return np.maximum(np.rint(np.log(size) / np.log(self.factor)), 0).astype(np.int64)
+        levels: Ints = np.maximum(np.rint(np.log(size) / np.log(self.factor)), 0).astype(np.int64)
+        return levels
 
     def sigma_px(self, octave: Ints) -> Floats:
         """Deviation of a keypoint's place where one pixel is that of the finest level."""

@@ -7,6 +7,7 @@ sorts pairs by one packed number and knows nothing of bits and floats.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 FARTHEST = 1023
 """No distance is larger; what is farther is given as this."""
 
-_BLOCK = 16  # rows of a table whose parts stay in a core's cache
+_BLOCK = 16  # descriptors against 2,000 others: the block stays in a core's second-level cache
 _UNIT = FARTHEST / 2.0  # two unit vectors are at most 2 apart
 
 
@@ -111,7 +112,8 @@ class UnitL2:
 
 def _steps(cosine: Floats32) -> Floats32:
     """The distance of unit vectors by their inner product, whole steps of 2 / 1023."""
-    return np.rint(np.sqrt(np.clip(2.0 - 2.0 * cosine, 0.0, 4.0)) * np.float32(_UNIT))
+    steps: Floats32 = np.rint(np.sqrt(np.clip(2.0 - 2.0 * cosine, 0.0, 4.0)) * np.float32(_UNIT))
+    return steps
 
 
 ORB = Hamming(32, 64, 50)
@@ -131,7 +133,7 @@ def hamming(a: Bytes, b: Bytes) -> Ints:
     """Bits that differ between descriptors ``(..., D)`` uint8 of any length, row by row."""
     xor = whole_words(a).view(np.uint64) ^ whole_words(b).view(np.uint64)
     bits = np.bitwise_count(xor)
-    total = bits[..., 0].astype(np.int64)
+    total: Ints = bits[..., 0].astype(np.int64)
     for word in range(1, bits.shape[-1]):  # additions of columns beat a sum along the short axis
         total += bits[..., word]
     return total
@@ -139,11 +141,39 @@ def hamming(a: Bytes, b: Bytes) -> Ints:
 
 def hamming_table(a: Bytes, b: Bytes) -> NDArray[np.uint16]:
     """``(N, M)`` bits that differ between all descriptors ``(N, D)`` and ``(M, D)``."""
+    table = np.empty((len(a), len(b)), dtype=np.uint16)
+    for start, distances in _hamming_blocks(a, b):
+        table[start : start + len(distances)] = distances
+    return table
+
+
+def hamming_nearest(a: Bytes, b: Bytes) -> NDArray[np.intp]:
+    """Index ``(N,)`` of the descriptor in ``b (M, D)`` that is nearest to each in ``a (N, D)``.
+
+    Ties go to the lowest index. No table ``(N, M)`` is held, so ``a`` may be long.
+    """
+    index = np.empty(len(a), dtype=np.intp)
+    for start, distances in _hamming_blocks(a, b):
+        index[start : start + len(distances)] = distances.argmin(axis=1)
+    return index
+
+
+def _hamming_blocks(a: Bytes, b: Bytes) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+    """Hamming distances of some descriptors in ``a`` after the other from all in ``b``.
+
+    Yields the index of the first descriptor, and distances ``(n, M)`` that are overwritten by the next.
+    """
     wide_a = whole_words(a).view(np.uint64)
     wide_b = np.ascontiguousarray(whole_words(b).view(np.uint64).T)
-    table = np.zeros((len(a), len(b)), dtype=np.uint16)
+    differing = np.empty((_BLOCK, len(b)), dtype=np.uint64)
+    bits = np.empty((_BLOCK, len(b)), dtype=np.uint8)
+    distances = np.empty((_BLOCK, len(b)), dtype=np.uint16)  # 256 does not fit uint8
     for start in range(0, len(a), _BLOCK):
         block = wide_a[start : start + _BLOCK]
+        n = len(block)
+        distances[:n] = 0
         for word, column in enumerate(wide_b):
-            table[start : start + _BLOCK] += np.bitwise_count(block[:, word, None] ^ column)
-    return table
+            np.bitwise_xor(block[:, word, None], column, out=differing[:n])
+            np.bitwise_count(differing[:n], out=bits[:n])
+            distances[:n] += bits[:n]
+        yield start, distances[:n]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.geometry import se3_exp
+from slamdepth.geometry import CHI2_2DOF_95, reprojection_errors, se3_exp
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-CHI2_2DOF_95 = 5.991
 HUBER = 1.345
 _NEAREST_M = 0.02
 _CONVERGED = 1e-5  # metres and radians: a hundredth of a pixel
@@ -136,7 +135,9 @@ def _newton_step(H: Floats, g: Floats) -> Floats:
     damped = H.copy()
     damped.flat[::7] += 1e-9 * H.trace()
     _, step, info = dposv(damped, g)
-    return -step if info == 0 else -np.linalg.lstsq(damped, g, rcond=None)[0]
+    if info != 0:
+        step = np.linalg.lstsq(damped, g, rcond=None)[0]
+    return np.asarray(-step, dtype=np.float64)
 
 
 class _Matches:
@@ -179,10 +180,7 @@ class _Matches:
 
     def residual(self, points_c: Floats, whitening: Floats) -> tuple[Floats, Floats]:
         """Whitened residuals ``(N,)`` of the two rows."""
-        camera = self.camera
-        z = np.maximum(points_c[2], _NEAREST_M)
-        du = camera.fx * points_c[0] / z + (camera.cx - self.px[0])
-        dv = camera.fy * points_c[1] / z + (camera.cy - self.px[1])
+        du, dv = reprojection_errors(self.camera, points_c, self.px, _NEAREST_M)
         return whitening[0] * du, whitening[1] * du + whitening[2] * dv
 
     def squared_residual(self, points_c: Floats, whitening: Floats) -> Floats:
