@@ -20,13 +20,15 @@ WIDE_VIEW_DEG = 120.0
 """Wider than a pinhole camera with Brown-Conrady distortion usually sees."""
 
 _UNDONE_SHARE = 0.05
-"""Of the longer side: real lenses come back to 0.2 % of it, those whose inverse diverges to 10 % and more."""
+"""Largest error of undistorting and distorting a pixel, as a share of the longer side: 0.2 % for real
+lenses, 10 % and more where the inverse diverges."""
 
 _LEAST_REACH = 0.9
-"""Of the way to the farthest corner: fits of real lenses may turn back where the board never was."""
+"""Least share of the way to the farthest corner before distortion folds back: fits of real lenses may fold
+where the calibration board never was."""
 
 _STRONGEST, _NEGLIGIBLE = 1e4, 1e-12
-"""Bounds within which a coefficient can be reckoned with."""
+"""Coefficients of a larger magnitude are refused, smaller ones count as zero."""
 
 
 class Pinhole(Protocol):
@@ -56,11 +58,14 @@ class Pinhole(Protocol):
 
 
 def check_plausible(camera: Pinhole) -> list[str]:
-    """Refuse intrinsics that no camera has, and say what is unusual, a line each.
+    """Refuse intrinsics that no camera has.
+
+    Returns:
+        What is unusual about them, one line each.
 
     Raises:
         CameraError: the principal point lies outside the image, or the distortion folds it or cannot be
-            undone; without the name of the file.
+            undone; the message does not name the file.
     """
     _check_principal_point(camera)
     notes = _check_distortion(camera)
@@ -106,7 +111,7 @@ def _check_principal_point(camera: Pinhole) -> None:
 
 
 def _check_distortion(camera: Pinhole) -> list[str]:
-    """What is unusual in it, a line each."""
+    """Refuse impossible distortion; return what is unusual about it, one line each."""
     if not camera.is_distorted:
         return []
     if max(map(abs, camera.distortion)) > _STRONGEST:
@@ -141,7 +146,7 @@ def _named(camera: Pinhole) -> str:
 
 
 def _distorted(camera: Pinhole, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels ``(N, 2)`` of the undistorted camera in the image as taken: Brown's model, written out."""
+    """Raw pixels ``(N, 2)`` of undistorted ones: Brown's model, written out."""
     x, y = ((points_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]).T
     k1, k2, p1, p2, k3 = camera.distortion
     r2 = x * x + y * y

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sequences: :func:`open_dataset` reads any known layout; ``camera.yaml`` holds intrinsics."""
+"""Sequences of images: :func:`open_dataset` reads any known layout."""
 
 from __future__ import annotations
 

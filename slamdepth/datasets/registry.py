@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which sequence layouts are known, and which of them a folder has.
+"""Sequence layouts by name, and :func:`open_dataset`, which finds the one a folder has.
 
 A layout is one file in ``slamdepth/datasets/readers/`` with a class under
 ``@register_reader``; the files are imported when the first sequence is opened.
@@ -69,14 +69,14 @@ def register_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
 def register_last_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
     """Class decorator for the :class:`Reader` that :func:`open_dataset` asks where no layout matches.
 
-    It is none of :func:`known_readers`, so whoever has an own use for folders of no layout keeps it.
+    :func:`known_readers` leaves it out, for callers that read folders without a layout in their own way.
     """
     _last_reader[:] = [reader_type()]
     return reader_type
 
 
 def known_readers() -> tuple[Reader, ...]:
-    """The reader of every layout, in order of its name."""
+    """The reader of every layout, sorted by name."""
     return tuple(READERS.get(name) for name in READERS.names())
 
 

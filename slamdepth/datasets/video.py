@@ -28,7 +28,7 @@ class VideoFile:
         path: the file.
         width, height: of a frame in pixels, turned upright as the file says.
         fps: frames per second; 30 where the file does not say, with a note.
-        frames_named: how many frames the file says it has, which may be wrong; 0 = does not say.
+        frames_named: number of frames by the file's header, which may be wrong; 0 where it has none.
         notes: what was guessed, one line each.
 
     Raises:
@@ -40,7 +40,7 @@ class VideoFile:
 
         if not path.is_file():
             raise DatasetError(f"{path}: no such video file")
-        # FFmpeg's own complaints, like OpenCV's in _open, would stand between progress bar and our one line.
+        # FFmpeg prints errors of its own, as OpenCV does in _open; they would break the progress bar.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         self.path = path
         self.notes: list[str] = []
@@ -61,10 +61,10 @@ class VideoFile:
         self.frames_named = round(named) if 0 < named < 1e9 else 0
 
     def timestamps_s(self) -> Floats:
-        """``(N,)`` times of all frames in seconds from the first; the video is decoded once for it.
+        """``(N,)`` times of all frames in seconds from the first; reads the whole video once.
 
-        A phone's frames do not come at equal intervals, so each says its own time. Where times do not
-        increase, they are counted by :attr:`fps`, with a note.
+        A phone's frames do not come at equal intervals, so the time of each is read. Where times do not
+        increase, they follow from :attr:`fps`, with a note.
         """
         import cv2
 
@@ -83,8 +83,8 @@ class VideoFile:
     def frames(self, stride: int = 1) -> Iterator[tuple[int, Callable[[], NDArray[np.uint8]]]]:
         """Every ``stride``-th frame: its number from 0, and a function that decodes it.
 
-        The function gives ``(H, W, 3)`` uint8 RGB and may be called before the next frame is
-        asked for; a frame that is not wanted costs less that way.
+        The function returns ``(H, W, 3)`` uint8 RGB and may be called until the next frame is taken.
+        Frames that are not decoded cost less.
 
         Raises:
             ImageDecodeError: from the function, the frame does not decode.

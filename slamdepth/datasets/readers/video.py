@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A video file as a sequence: no depth, no ground truth, and a camera that has to be named."""
+"""A video file as a sequence without depth and ground truth; its camera has to be given."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class VideoReader:
     def open(self, path: Path, camera: Camera | None) -> VideoSequence:
         video = VideoFile(path)
         if camera is None:
-            # a camera.yaml that lies beside a video may be another's
+            # a camera.yaml next to a video may belong to another one
             raise CameraError(
                 f"{path}: the intrinsics of a video are unknown: pass --camera FILE, a camera.yaml with "
                 f"{what_to_write(video.width, video.height)}"
