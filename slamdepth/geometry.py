@@ -61,7 +61,7 @@ def so3_exp(omega: Floats) -> Floats:
 
 
 def _so3_exp_single(x: float, y: float, z: float) -> Floats:
-    """:func:`so3_exp` of one vector, which optimisers need a dozen times a frame, in plain numbers."""
+    """Rotation matrix ``(3, 3)`` of one rotation vector, in scalar arithmetic, which is faster for one."""
     xx, yy, zz = x * x, y * y, z * z
     theta2 = xx + yy + zz
     if theta2 < 1e-12:
@@ -155,7 +155,7 @@ def quat_xyzw_to_rotation(quat_xyzw: Floats) -> Floats:
 def rotation_to_quat_xyzw(R: Floats) -> Floats:
     """Quaternions ``(..., 4)`` x y z w with w >= 0 of rotation matrices ``(..., 3, 3)``.
 
-    By the largest of the four candidates (Shepperd 1978), so never by a small divisor.
+    Divides by the largest of the four candidates (Shepperd 1978), never by a small number.
     """
     R = np.asarray(R, dtype=np.float64)
     m = R.reshape(-1, 3, 3)

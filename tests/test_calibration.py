@@ -20,7 +20,7 @@ RELAXED = settings(
 GOOD = "width: 640\nheight: 480\nfx: 500\nfy: 501.5\ncx: 320\ncy: 240\n"
 
 
-def test_defaults_are_those_of_the_issue(tmp_path: Path) -> None:
+def test_optional_keys_have_defaults(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
     camera = Camera.from_file(path)

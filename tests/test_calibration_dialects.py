@@ -105,18 +105,24 @@ real = st.floats(-1e-2, 1e-2)
     st.lists(real, max_size=5), st.sampled_from(["yml", "json"]),
 )  # fmt: skip
 def test_what_opencv_writes_comes_back(
-    tmp_path: Path, focal: tuple[float, float], centre: tuple[float, float], bent: list[float], ending: str
+    tmp_path: Path,
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    distortion: list[float],
+    ending: str,
 ) -> None:
     path = tmp_path / f"own.{ending}"
     storage = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)
     storage.write("image_width", 640)
     storage.write("image_height", 480)
     storage.write("camera_matrix", np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]]))
-    storage.write("distortion_coefficients", np.array([bent or [0.0]]))
+    storage.write("distortion_coefficients", np.array([distortion or [0.0]]))
     storage.release()
     camera = Camera.from_file(path, [])
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((*focal, *centre), rel=1e-14)
-    assert camera.distortion == pytest.approx((*bent, *[0.0] * (5 - len(bent))), rel=1e-14, abs=1e-300)
+    assert camera.distortion == pytest.approx(
+        (*distortion, *[0.0] * (5 - len(distortion))), rel=1e-14, abs=1e-300
+    )
 
 
 @RELAXED
@@ -125,17 +131,17 @@ def test_what_opencv_writes_comes_back(
     st.lists(real, min_size=4, max_size=5),
 )  # fmt: skip
 def test_what_ros_writes_comes_back(
-    tmp_path: Path, focal: tuple[float, float], centre: tuple[float, float], bent: list[float]
+    tmp_path: Path, focal: tuple[float, float], centre: tuple[float, float], distortion: list[float]
 ) -> None:
     K = [focal[0], 0.0, centre[0], 0.0, focal[1], centre[1], 0.0, 0.0, 1.0]
     values: dict[str, Any] = {
         "image_width": 640, "image_height": 480, "distortion_model": "plumb_bob",
         "camera_matrix": {"rows": 3, "cols": 3, "data": K},
-        "distortion_coefficients": {"rows": 1, "cols": len(bent), "data": bent},
+        "distortion_coefficients": {"rows": 1, "cols": len(distortion), "data": distortion},
     }  # fmt: skip
     camera = read(tmp_path, yaml.safe_dump(values))
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (*focal, *centre)
-    assert camera.distortion == (*bent, *[0.0] * (5 - len(bent)))
+    assert camera.distortion == (*distortion, *[0.0] * (5 - len(distortion)))
 
 
 def ros(what: str, by: str) -> str:

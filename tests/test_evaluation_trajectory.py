@@ -30,7 +30,7 @@ def wavy(count: int = 90, rate_hz: float = 30.0, start_s: float = 1000.0) -> Tra
     return Trajectory(start_s + t, poses)
 
 
-def disturbed(trajectory: Trajectory, scale: float = 1.0, noise: float = 0.01, seed: int = 0) -> Trajectory:
+def perturbed(trajectory: Trajectory, scale: float = 1.0, noise: float = 0.01, seed: int = 0) -> Trajectory:
     """The trajectory scaled, moved to another world, and shaken."""
     rng = np.random.default_rng(seed)
     poses = trajectory.T_world_camera.copy()
@@ -41,7 +41,7 @@ def disturbed(trajectory: Trajectory, scale: float = 1.0, noise: float = 0.01, s
 
 
 def test_a_moved_copy_has_no_error() -> None:
-    score = score_trajectory(wavy(), disturbed(wavy(), noise=0.0))
+    score = score_trajectory(wavy(), perturbed(wavy(), noise=0.0))
     assert score.se3.rmse_m < 1e-12
     assert score.sim3.scale == pytest.approx(1.0, abs=1e-12)
     assert score.per_frame.trans_rmse_m < 1e-12
@@ -50,7 +50,7 @@ def test_a_moved_copy_has_no_error() -> None:
 
 
 def test_scale_is_what_the_estimate_must_be_multiplied_by() -> None:
-    score = score_trajectory(wavy(), disturbed(wavy(), scale=0.5, noise=0.0))
+    score = score_trajectory(wavy(), perturbed(wavy(), scale=0.5, noise=0.0))
     assert score.sim3.scale == pytest.approx(2.0, rel=1e-12)
     assert score.sim3.rmse_m < 1e-12
     assert score.se3.rmse_m > 0.1
@@ -58,7 +58,7 @@ def test_scale_is_what_the_estimate_must_be_multiplied_by() -> None:
 
 
 def test_agrees_with_an_independent_computation() -> None:
-    truth, estimate = wavy(), disturbed(wavy(), scale=0.8)
+    truth, estimate = wavy(), perturbed(wavy(), scale=0.8)
     score = score_trajectory(truth, estimate)
     p, q = truth.T_world_camera[:, :3, 3], estimate.T_world_camera[:, :3, 3]
     for error, with_scale in ((score.se3, False), (score.sim3, True)):
@@ -86,7 +86,7 @@ def test_agrees_with_an_independent_computation() -> None:
 
 
 def test_inputs_are_not_changed() -> None:
-    truth, estimate = wavy(), disturbed(wavy())
+    truth, estimate = wavy(), perturbed(wavy())
     before = truth.T_world_camera.copy(), estimate.T_world_camera.copy()
     score_trajectory(truth, estimate)
     np.testing.assert_array_equal(truth.T_world_camera, before[0])
@@ -126,7 +126,7 @@ def test_rate_comes_from_the_estimate_or_from_the_caller() -> None:
 
 
 def test_to_dict_is_json_with_nulls() -> None:
-    score = score_trajectory(wavy(count=12), disturbed(wavy(count=12)))
+    score = score_trajectory(wavy(count=12), perturbed(wavy(count=12)))
     figures = json.loads(json.dumps(score.to_dict()))
     assert figures["ate"]["se3"]["rmse_m"] == score.se3.rmse_m
     assert figures["ate"]["sim3"]["scale"] == score.sim3.scale
@@ -223,7 +223,7 @@ def assert_agrees_with_evo(truth_file: Path, estimate_file: Path, home: Path, *o
 
 def test_agrees_with_evos_own_commands(tmp_path: Path) -> None:
     truth = wavy(count=400, rate_hz=100.0)
-    shaken = disturbed(truth, scale=0.9)
+    shaken = perturbed(truth, scale=0.9)
     kept = np.r_[2:200:3, 230:400:3]
     estimate = Trajectory(shaken.timestamps_s[kept] + 0.002, shaken.T_world_camera[kept])
     write_tum_trajectory(tmp_path / "truth.txt", truth)
@@ -238,7 +238,7 @@ def test_agrees_with_evos_own_commands(tmp_path: Path) -> None:
 def test_agrees_with_evos_own_commands_on_a_real_ground_truth(tmp_path: Path, data_dir: Path) -> None:
     truth_file = data_dir / "rgbd_dataset_freiburg1_rpy" / "groundtruth.txt"
     truth, _ = read_tum_trajectory(truth_file)
-    shaken = disturbed(truth, scale=1.2, noise=0.005)
+    shaken = perturbed(truth, scale=1.2, noise=0.005)
     write_tum_trajectory(
         tmp_path / "estimate.txt",
         Trajectory(shaken.timestamps_s[100:2100:3] + 0.001, shaken.T_world_camera[100:2100:3]),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every feature promises: how many, where, how sure, and the same each time."""
+"""What every extractor promises: count, spread, uncertainty and determinism."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_descriptors_are_what_the_metric_compares(extractor: FeatureExtractor) -
         np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1.0, atol=1e-4)
 
 
-def test_larger_keypoints_are_less_sure(extractor: FeatureExtractor) -> None:
+def test_larger_keypoints_are_less_certain(extractor: FeatureExtractor) -> None:
     features = extractor.extract(image(), CAMERA)
     np.testing.assert_allclose(features.sigma_px, extractor.levels.sigma_px(features.octave))
     sigma = extractor.levels.sigma_px(np.arange(extractor.levels.count))

@@ -135,9 +135,9 @@ def test_the_optical_axis_meets_the_principal_point() -> None:
 def test_orthonormalised_is_near_and_exact(seed: int) -> None:
     rng = np.random.default_rng(seed)
     T = se3_exp(rng.normal(size=6))
-    bent = T.copy()
-    bent[:3, :3] += 1e-4 * rng.normal(size=(3, 3))
-    fixed = orthonormalised(bent)
+    inexact = T.copy()
+    inexact[:3, :3] += 1e-4 * rng.normal(size=(3, 3))
+    fixed = orthonormalised(inexact)
     np.testing.assert_allclose(fixed[:3, :3] @ fixed[:3, :3].T, np.eye(3), atol=1e-14)
     assert np.linalg.det(fixed[:3, :3]) > 0
     np.testing.assert_allclose(fixed, T, atol=1e-3)

@@ -119,7 +119,7 @@ def test_the_rate_is_the_derivative() -> None:
     ("change_s", "sigma_s", "readout_s"),
     [
         (0.02, 0.001, 0.02),
-        (0.002, 0.001, 0.0),  # within its doubt: global
+        (0.002, 0.001, 0.0),  # within its uncertainty: global
         (0.02, 0.01, 0.0),  # too unsure to say anything
         (0.2, 0.001, 0.0),  # absurd
         (0.04, 0.001, 1 / 30),  # longer than a frame
@@ -146,7 +146,7 @@ def tracked(frames: list[Frame], config: Config = CONFIG) -> Reconstruction:
 
 
 def upright(frame: Frame) -> Frame:
-    """The same taken by the camera held upright, turned a quarter to the left."""
+    """The rolling frames taken by an upright camera, turned a quarter to the left."""
     camera = replace(
         CAMERA,
         width=CAMERA.height,
@@ -230,7 +230,7 @@ def test_a_cut_in_the_recording_is_no_motion(rolling_frames: list[Frame], cut: i
     np.testing.assert_allclose(made[cut:], made[:16], atol=0.03)
 
 
-def test_a_frame_found_anew_is_as_fast_as_the_frames_after_it() -> None:
+def test_a_reregistered_frame_is_as_fast_as_the_frames_after_it() -> None:
     """It was placed without a velocity, so its own place is not to be trusted for one."""
     landmarks = LandmarkMap()
     log = FrameLog(PINHOLE, landmarks)

@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ScaleLevels:
-    """The sizes features come in.
+    """The scale levels of an extractor's keypoints.
 
     Attributes:
-        factor: a level's size over that of the one before.
-        count: how many there are.
-        growth: the place of a keypoint gets unsure with this power of its size.
+        factor: ratio of a level's size to that of the previous one.
+        count: number of levels.
+        growth: a keypoint's standard deviation grows with this power of its size.
     """
 
     factor: float
@@ -43,17 +43,17 @@ class ScaleLevels:
     growth: float = 1.0
 
     def of(self, size: Floats) -> Ints:
-        """Level of keypoints ``(N,)`` that are so many times as large as the finest; may be past the last."""
+        """Levels ``(N,)`` of keypoints of these sizes, 1 being the finest; may be past the last level."""
         levels: Ints = np.maximum(np.rint(np.log(size) / np.log(self.factor)), 0).astype(np.int64)
         return levels
 
     def sigma_px(self, octave: Ints) -> Floats:
-        """Deviation of a keypoint's place where one pixel is that of the finest level."""
+        """Standard deviations ``(N,)`` of keypoints in pixels; one pixel at the finest level."""
         return self.factor ** (self.growth * octave.astype(np.float64))
 
 
 class ImageMatcher(Protocol):
-    """Matches two whole images by more than each descriptor alone."""
+    """Matches the features of two images jointly, as LightGlue does."""
 
     def __call__(self, a: Features, b: Features) -> tuple[Ints, Ints]:
         """Pairs, as indices ``(P,)`` in ``a`` and ``b``, one to one."""
@@ -73,7 +73,7 @@ class Features:
         metric: how descriptors are compared.
         orb_descriptors: gives ORB descriptors ``(M, 32)`` of the same image, for place
             recognition; None where ``descriptors`` are ORB's.
-        matcher: matches whole images; None compares descriptors one by one.
+        matcher: matches whole images; None compares descriptors pairwise.
 
     Raises:
         TrackingError: the descriptors are not those of the metric.
@@ -101,20 +101,20 @@ class Features:
 
     @cached_property
     def grid(self) -> PixelGrid:
-        """``px`` sorted into cells; made once, since a keyframe is searched again and again."""
+        """``px`` in a grid of cells; cached, as a keyframe is searched many times."""
         return PixelGrid(self.px)
 
     @property
     def place_descriptors(self) -> NDArray[np.uint8]:
-        """ORB descriptors ``(M, 32)`` of the image: what places are recognised by."""
+        """ORB descriptors ``(M, 32)`` of the image, for place recognition."""
         return self.descriptors if self.orb_descriptors is None else self.orb_descriptors()
 
     def match(self, other: Features, among: Ints, *, ratio: float) -> tuple[Ints, Ints]:
-        """Match the keypoints ``among`` of this image with all of another, wherever they are.
+        """Match the keypoints ``among`` of this image with all of another, anywhere in it.
 
         Args:
-            among: ``(K,)`` indices, ascending, each once.
-            ratio: a match is so much nearer than the second; unless ``matcher`` decides.
+            among: ``(K,)`` unique indices, ascending.
+            ratio: of Lowe's test; not used where there is a ``matcher``.
 
         Returns:
             Pairs as indices into ``among`` and into ``other``, one to one.
@@ -214,6 +214,6 @@ def create_extractor(config: FeatureConfig) -> FeatureExtractor:
 
 
 def feature_weights(config: FeatureConfig) -> tuple[WeightsInfo, ...]:
-    """The files of networks that ``config`` names; what they were trained on they do not say."""
+    """The weights files that ``config`` names; what they were trained on is unknown."""
     files = [Path(name).expanduser() for name in (config.weights, config.matcher) if name is not None]
     return tuple(WeightsInfo(file.stem, sha256_of(file), "unknown", "unknown") for file in files)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def pixels(keypoints: Sequence[Any]) -> Floats:
-    """Where OpenCV's keypoints are, ``(N, 2)``."""
+    """Positions ``(N, 2)`` of OpenCV's keypoints in pixels."""
     import cv2
 
     if len(keypoints) == 0:
@@ -24,12 +24,12 @@ def pixels(keypoints: Sequence[Any]) -> Floats:
 
 
 def responses(keypoints: Sequence[Any]) -> Floats:
-    """How strong OpenCV's keypoints are, ``(N,)``."""
+    """Responses ``(N,)`` of OpenCV's keypoints."""
     return np.array([k.response for k in keypoints], dtype=np.float64)
 
 
 def spread(px: Floats, response: Floats, count: int, cell_px: float) -> Ints:
-    """Choose ``count`` keypoints evenly: every cell's best first, then every cell's second.
+    """Choose keypoints evenly over the image: each cell's best first, then each cell's second best.
 
     Args:
         px: ``(N, 2)`` pixels.
@@ -55,5 +55,5 @@ def spread(px: Floats, response: Floats, count: int, cell_px: float) -> Ints:
 
 
 def cell_edge_px(gray: NDArray[np.uint8], count: int) -> float:
-    """Edge of a cell for :func:`spread`: about two keypoints a cell."""
+    """Edge of a cell for :func:`spread` that gives about two keypoints per cell."""
     return float(np.sqrt(gray.shape[0] * gray.shape[1] / count) * 1.5)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far two descriptors are from one another, and how near they must be to show one point.
+"""Distances between descriptors, and the thresholds of a match.
 
-A distance is an integer from 0 to :data:`FARTHEST`, whatever the descriptor: so matching
-sorts pairs by one packed number and knows nothing of bits and floats.
+A distance is an integer from 0 to :data:`FARTHEST` for every kind of descriptor, so that matching
+sorts pairs by one packed number.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     Descriptors = NDArray[Any]
 
 FARTHEST = 1023
-"""No distance is larger; what is farther is given as this."""
+"""The largest distance; larger ones are clipped to it."""
 
 _BLOCK = 16  # descriptors against 2,000 others: the block stays in a core's second-level cache
 _UNIT = FARTHEST / 2.0  # two unit vectors are at most 2 apart
 
 
 class DescriptorMetric(Protocol):
-    """What matching knows of descriptors.
+    """The distance between two descriptors of one kind, and its thresholds.
 
     Attributes:
-        max_distance: two descriptors farther apart are never one point.
-        strict_distance: the same where a wrong match would stay in the map.
+        max_distance: largest distance of a match.
+        strict_distance: largest distance where a wrong match would stay in the map.
     """
 
     @property
@@ -57,10 +57,11 @@ class DescriptorMetric(Protocol):
 
 @dataclass(frozen=True)
 class Hamming:
-    """Bits that differ between binary descriptors ``(N, size)`` uint8.
+    """Hamming distance of binary descriptors ``(N, size)`` uint8.
 
     Attributes:
-        size: bytes of a descriptor; a multiple of 8 is fastest, see :func:`whole_words`.
+        size: bytes per descriptor; a multiple of 8 is fastest, see :func:`whole_words`.
+        max_distance, strict_distance: see :class:`DescriptorMetric`.
     """
 
     size: int = 32
@@ -111,17 +112,17 @@ class UnitL2:
 
 
 def _steps(cosine: Floats32) -> Floats32:
-    """The distance of unit vectors by their inner product, whole steps of 2 / 1023."""
+    """Distances of unit vectors from their inner products, in whole steps of 2 / 1023."""
     steps: Floats32 = np.rint(np.sqrt(np.clip(2.0 - 2.0 * cosine, 0.0, 4.0)) * np.float32(_UNIT))
     return steps
 
 
 ORB = Hamming(32, 64, 50)
-"""Of ORB's 256 bits."""
+"""The metric of ORB's 256 bits."""
 
 
 def whole_words(descriptors: Bytes) -> Bytes:
-    """Binary descriptors ``(..., D)`` filled up with zeros to a multiple of 8 bytes."""
+    """Binary descriptors ``(..., D)`` padded with zeros to a multiple of 8 bytes."""
     rest = -descriptors.shape[-1] % 8
     if rest == 0:
         return np.ascontiguousarray(descriptors)
@@ -130,7 +131,7 @@ def whole_words(descriptors: Bytes) -> Bytes:
 
 
 def hamming(a: Bytes, b: Bytes) -> Ints:
-    """Bits that differ between descriptors ``(..., D)`` uint8 of any length, row by row."""
+    """Hamming distances of descriptors ``(..., D)`` uint8 of any length, row by row."""
     xor = whole_words(a).view(np.uint64) ^ whole_words(b).view(np.uint64)
     bits = np.bitwise_count(xor)
     total: Ints = bits[..., 0].astype(np.int64)
@@ -140,7 +141,7 @@ def hamming(a: Bytes, b: Bytes) -> Ints:
 
 
 def hamming_table(a: Bytes, b: Bytes) -> NDArray[np.uint16]:
-    """``(N, M)`` bits that differ between all descriptors ``(N, D)`` and ``(M, D)``."""
+    """Hamming distances ``(N, M)`` of all descriptors ``(N, D)`` from all ``(M, D)``."""
     table = np.empty((len(a), len(b)), dtype=np.uint16)
     for start, distances in _hamming_blocks(a, b):
         table[start : start + len(distances)] = distances
@@ -159,9 +160,10 @@ def hamming_nearest(a: Bytes, b: Bytes) -> NDArray[np.intp]:
 
 
 def _hamming_blocks(a: Bytes, b: Bytes) -> Iterator[tuple[int, NDArray[np.uint16]]]:
-    """Hamming distances of some descriptors in ``a`` after the other from all in ``b``.
+    """Hamming distances of ``a (N, D)`` from ``b (M, D)``, block by block.
 
-    Yields the index of the first descriptor, and distances ``(n, M)`` that are overwritten by the next.
+    Yields:
+        Index of the block's first descriptor in ``a``, and distances ``(n, M)`` in a reused buffer.
     """
     wide_a = whole_words(a).view(np.uint64)
     wide_b = np.ascontiguousarray(whole_words(b).view(np.uint64).T)

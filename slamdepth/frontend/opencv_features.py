@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What OpenCV's features have in common: detect widely, describe, keep an even share."""
+"""Extractors made of OpenCV's ``Feature2D``: many keypoints are detected, an even share is kept."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class OpenCvExtractor:
 
     Args:
         algorithm: set so that it finds more than ``count`` in most images.
-        count: keypoints kept of an image.
-        metric: of what :meth:`descriptors` returns.
-        levels: sizes of keypoints; larger than the last are dropped.
+        count: keypoints kept per image.
+        metric: of the descriptors that :meth:`descriptors` returns.
+        levels: scale levels; larger keypoints than those of the last are dropped.
         finest_px: ``cv2.KeyPoint.size`` of level 0.
     """
 
@@ -71,7 +71,7 @@ class OpenCvExtractor:
 
 
 def opencv_class(name: str, feature: str) -> Any:
-    """OpenCV's class ``name``, wherever this version keeps it.
+    """OpenCV's class ``name``, from whichever module this version has it in.
 
     Raises:
         ConfigError: this build lacks it; says which package brings it.
@@ -89,10 +89,10 @@ def opencv_class(name: str, feature: str) -> Any:
 
 
 def _first_of_each(px: Floats) -> NDArray[np.int64]:
-    """Indices of the keypoints that share their place with none before.
+    """Indices of the first keypoint at each pixel.
 
-    SIFT describes one place once for each direction it may have; as two features at one
-    pixel they would become two map points.
+    SIFT describes one pixel once for each orientation it may have; two features at one pixel would
+    become two landmarks.
     """
     _, first = np.unique(px, axis=0, return_index=True)
     return np.sort(first)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ORB descriptors of an image for place recognition, whatever its features are."""
+"""ORB descriptors of an image for place recognition, where its features are others."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class OrbDescriptors:
 
     Args:
         gray: ``(H, W)`` uint8.
-        count: how many at most.
+        count: largest number of descriptors.
     """
 
     def __init__(self, gray: NDArray[np.uint8], count: int) -> None:
