@@ -83,7 +83,7 @@ class BundleConfig(_Section):
     prior_inflation: float = Field(
         6.0,
         ge=1,
-        description="divisor of each predicted depth's weight: errors of neighbouring pixels are correlated",
+        description="factor on the deviation of predicted depths: errors of neighbours are correlated",
     )
     scale_sigma: float = Field(0.1, ge=0, description="deviation of a keyframe's common relative depth error")
 

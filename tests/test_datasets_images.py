@@ -12,13 +12,11 @@ from command_line import call
 from hypothesis import given
 from hypothesis import strategies as st
 from sequences import CAMERA, depth_raw, image_rgb, make_sevenscenes, make_tum, write_image
-from tracking_scene import register_constant_depth
 
 from slamdepth.datasets import Dataset, known_readers, open_dataset, write_camera
 from slamdepth.datasets.readers.images import FolderSequence, ImagesReader
 from slamdepth.datasets.resizing import LONGEST_SIDE_PX, reduced_camera
 from slamdepth.errors import CameraError, DatasetError, InputError
-from slamdepth.geometry import rotation_angle_rad
 from slamdepth.io import read_tum_trajectory
 from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.types import Camera
@@ -148,32 +146,6 @@ def test_garbage_is_refused(tmp_path_factory: pytest.TempPathFactory, contents: 
         (folder / f"{number}.png").write_bytes(content)
     with pytest.raises(InputError):
         open_dataset(folder)
-
-
-def test_a_folder_of_images_is_run_like_its_sequence(
-    tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    register_constant_depth(monkeypatch)
-    folder = tmp_path / "images"
-    folder.mkdir()
-    for number, path in enumerate(sorted((tiny_room / "rgb").iterdir())):
-        (folder / f"frame-{number + 1}.png").symlink_to(path)
-    write_camera(tmp_path / "own.yaml", Camera.from_file(tiny_room / "camera.yaml"))
-    done = call("run", folder, "--depth", "constant", "--no-mesh", "-o", tmp_path / "refused")
-    assert done.returncode == 2
-    assert done.stderr.count("error: ") == 1
-    assert "the intrinsics of these images are unknown" in done.stderr
-    assert not (tmp_path / "refused").exists()
-    turns = []
-    own = ["--camera", tmp_path / "own.yaml"]
-    for name, sequence, more in (("alone", folder, own), ("listed", tiny_room, [])):
-        done = call("run", sequence, "--depth", "constant", "--no-mesh", "-q", "-o", tmp_path / name, *more)
-        assert done.returncode == 0, done.stderr
-        trajectory, _ = read_tum_trajectory(tmp_path / name / "trajectory.txt")
-        assert len(trajectory) == 40
-        turns.append(trajectory.T_world_camera[:, :3, :3])
-    assert "times are counted: 40 images" in (tmp_path / "alone" / "report.json").read_text()
-    assert rotation_angle_rad(np.swapaxes(turns[0], 1, 2) @ turns[1]).max() < 1e-6
 
 
 @pytest.mark.data

@@ -9,15 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import call
-from tracking_scene import register_constant_depth
 
 from slamdepth.datasets import Dataset, open_dataset, write_camera
 from slamdepth.datasets.readers.video import VideoSequence
 from slamdepth.datasets.video import VideoFile
 from slamdepth.errors import CameraError, DatasetError
-from slamdepth.geometry import rotation_angle_rad
-from slamdepth.io import read_tum_trajectory
 from slamdepth.types import Camera
 
 COUNT = 12
@@ -143,28 +139,3 @@ def test_each_frame_says_its_own_time(
     monkeypatch.setattr(video, "_open", Capture)
     np.testing.assert_allclose(video.timestamps_s(), expected_s)
     assert len(video.notes) == notes
-
-
-def test_a_video_is_run_like_its_frames(
-    tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The trajectory of a video of the rendered room is about the one of its images."""
-
-    register_constant_depth(monkeypatch)
-    images = [cv2.imread(str(path)) for path in sorted((tiny_room / "rgb").iterdir())]
-    camera = Camera.from_file(tiny_room / "camera.yaml")
-    video = write_video(tmp_path / "room.avi", images, camera.fps)
-    write_camera(tmp_path / "phone.yaml", camera)
-    turns = []
-    phone = ["--camera", tmp_path / "phone.yaml"]
-    for name, sequence, more in (("video", video, phone), ("frames", tiny_room, [])):
-        done = call("run", sequence, "--depth", "constant", "--no-mesh", "-q", "-o", tmp_path / name, *more)
-        assert done.returncode == 0, done.stderr
-        trajectory, _ = read_tum_trajectory(tmp_path / name / "trajectory.txt")
-        assert len(trajectory) == len(images)
-        turns.append(trajectory.T_world_camera[:, :3, :3])
-    assert rotation_angle_rad(turns[1]).max() > 0.1
-    assert rotation_angle_rad(np.swapaxes(turns[0], 1, 2) @ turns[1]).max() < 0.02
-    refused = call("run", video, "--depth", "sensor", "--camera", tmp_path / "phone.yaml")
-    assert refused.returncode == 2
-    assert "has no sensor depth" in refused.stderr
