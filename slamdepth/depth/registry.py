@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth models by name; a model's module is imported when it is first asked for.
 
-A new model is one new module beside this one whose class (or factory) carries
-``@register("its-name")``, and one line in ``_MODULES``. A package of its own adds one by an
+A new model is a module of this package whose class (or factory) carries
+``@register("its-name")``, and a line in ``_MODULES``. A package of its own adds one by an
 entry point of the group ``slamdepth.depth_models``, whose name is the model's and whose
 object is such a factory.
 """

@@ -151,7 +151,7 @@ def hamming_table(a: Bytes, b: Bytes) -> NDArray[np.uint16]:
 def hamming_nearest(a: Bytes, b: Bytes) -> NDArray[np.intp]:
     """Index ``(N,)`` of the descriptor in ``b (M, D)`` that is nearest to each in ``a (N, D)``.
 
-    Ties go to the lowest index. No table ``(N, M)`` is held, so ``a`` may be long.
+    Ties go to the lowest index. Memory does not grow with ``N`` times ``M``.
     """
     index = np.empty(len(a), dtype=np.intp)
     for start, distances in _hamming_blocks(a, b):
