@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a trained head goes is checked before anything is computed."""
+"""The output of a training is checked before anything is computed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def make_others(folder: Path) -> None:
         ("n" * 300 + ".safetensors", "cannot be written"),
     ],
 )
-def test_a_wrong_place_is_told_before_any_work(
+def test_a_bad_output_is_an_error_before_any_work(
     settings: dict[str, Any], name: str, says: str, tmp_path: Path
 ) -> None:
     make_others(tmp_path)
@@ -61,7 +61,7 @@ def test_a_wrong_place_is_told_before_any_work(
     assert (tmp_path / "precious.safetensors").read_text() == "precious"
 
 
-def test_a_folder_without_permission_is_told(
+def test_a_folder_without_permission_is_an_error(
     settings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Path] = []
@@ -87,7 +87,7 @@ def test_a_home_folder_is_expanded(
         check_output(config.model_copy(update={"output": "~nobody-of-this-name/head.safetensors"}))
 
 
-def test_the_command_says_it_in_one_line(settings: dict[str, Any], tmp_path: Path) -> None:
+def test_the_command_prints_one_line(settings: dict[str, Any], tmp_path: Path) -> None:
     make_others(tmp_path)
     file = tmp_path / "train.yaml"
     for more in ([], ["--dry-run"], ["--search", "1"]):

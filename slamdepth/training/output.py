@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a trained head goes, and whether it can go there; asked before anything is computed."""
+"""The output file of a training, checked before anything is computed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ENDING = ".safetensors"
 
 
 def output_path(config: TrainConfig) -> Path:
-    """The head's file, ``~`` expanded.
+    """The head file, with ``~`` expanded.
 
     Raises:
         OutputError: there is no such user.
