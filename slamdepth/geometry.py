@@ -128,6 +128,21 @@ def orthonormalised(T: Floats) -> Floats:
     return out
 
 
+def look_at(eye_w: Floats, target_w: Floats, down_w: Floats) -> Floats:
+    """``T_world_camera (4, 4)`` of a level camera at ``eye_w (3,)`` with ``target_w (3,)`` in its centre.
+
+    Args:
+        down_w: ``(3,)`` direction of gravity, not parallel to the view.
+    """
+    T = np.eye(4)
+    ahead = (target_w - eye_w) / np.linalg.norm(target_w - eye_w)
+    right = np.cross(down_w, ahead)
+    right /= np.linalg.norm(right)
+    T[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    T[:3, 3] = eye_w
+    return T
+
+
 def quat_xyzw_to_rotation(quat_xyzw: Floats) -> Floats:
     """Rotation matrices ``(..., 3, 3)`` of quaternions ``(..., 4)`` in TUM order x y z w."""
     q = np.asarray(quat_xyzw, dtype=np.float64)

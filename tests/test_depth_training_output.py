@@ -15,7 +15,6 @@ from training_places import tiny_settings
 
 from slamdepth.errors import OutputError
 from slamdepth.pipeline.training import plan_run, run_search, run_training
-from slamdepth.training import output as training_output
 from slamdepth.training.checkpoint import checkpoint_path
 from slamdepth.training.config import TrainConfig
 from slamdepth.training.output import check_output
@@ -65,7 +64,7 @@ def test_a_folder_without_permission_is_an_error(
     settings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Path] = []
-    monkeypatch.setattr(training_output.os, "access", lambda path, mode: asked.append(path))
+    monkeypatch.setattr("os.access", lambda path, mode: asked.append(path))
     config = TrainConfig.from_dict({**settings, "output": str(tmp_path / "new" / "head.safetensors")})
     with pytest.raises(OutputError, match="no permission to write to"):
         check_output(config)

@@ -39,7 +39,7 @@ def train_depth_command(
     """
     show_log()
     from slamdepth.cli.train_show import plan_lines, plan_table, training_bars, trials_table
-    from slamdepth.pipeline.folder import writable
+    from slamdepth.io import writable
     from slamdepth.pipeline.training import plan_run, report_folder, run_search, run_training
     from slamdepth.training.config import TrainConfig
     from slamdepth.training.output import check_output

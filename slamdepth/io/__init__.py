@@ -12,6 +12,7 @@ from slamdepth.io.images import (
     write_npy,
     write_png,
 )
+from slamdepth.io.outputs import writable, writable_file
 from slamdepth.io.ply import encode_ply, write_point_cloud
 from slamdepth.io.text import parse_float, read_lines, replacing, write_json, write_text
 from slamdepth.io.trajectory import (
@@ -32,6 +33,8 @@ __all__ = [
     "read_lines",
     "read_tum_trajectory",
     "replacing",
+    "writable",
+    "writable_file",
     "write_camera",
     "write_depth_mm",
     "write_json",

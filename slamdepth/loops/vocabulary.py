@@ -96,7 +96,7 @@ def load_vocabulary(path: str | Path | None = None) -> Vocabulary:
     except Exception as error:  # numpy and zipfile raise a zoo of types for a damaged file
         raise WeightsError(
             f"{origin}: cannot read the vocabulary ({error}); reinstall slamdepth or train one with "
-            "'python -m data_scripts.train_vocabulary'"
+            "'python data_scripts/train_vocabulary.py'"
         ) from error
 
 
