@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from slamdepth.training.data import PlaceReader
 from slamdepth.training.features import encode, sample_specs
 from slamdepth.training.losses import total_loss
 from slamdepth.training.member import head_shape, steps_per_epoch
-from slamdepth.training.out_of_fold import plan_folds
+from slamdepth.training.out_of_fold import Fold, plan_folds
 from slamdepth.training.output import check_output
 from slamdepth.training.stages import predict
 from slamdepth.training.store import Spec, bytes_per_sample, done_on_disk
@@ -109,14 +109,8 @@ def plan_training(
     patch = encoder.backbone.patch if encoder else PATCH
     specs = sample_specs(config.view, config.head.taps, dim, patch)
     sources = tuple(_planned_source(plan, specs) for plan in planned)
-    steps = sum(
-        steps_per_epoch(config, sum(len(plan.keys) for plan in of_member(planned, planned, member)))
-        for member in range(config.members)
-    )
     folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
-    fold_steps = config.coarse_epochs * sum(
-        steps_per_epoch(config, sum(map(len, fold.training))) for fold in folds
-    )
+    steps, fold_steps = _member_steps(config, planned), _fold_steps(config, folds)
     features_s = training_s = None
     if encoder is not None:
         todo = sum(source.samples - source.cached for source in sources)
@@ -128,6 +122,19 @@ def plan_training(
         training_s += uncertainty_s(planned, folds, dim) if folds else 0.0
     total = steps * (config.coarse_epochs + config.fine_epochs) + fold_steps
     return TrainingPlan(sources, total, features_s, training_s, missing, benchmarks_seen(planned))
+
+
+def _member_steps(config: TrainConfig, planned: Sequence[PlannedCache]) -> int:
+    """Steps of all members in one epoch."""
+    return sum(
+        steps_per_epoch(config, sum(len(plan.keys) for plan in of_member(planned, planned, member)))
+        for member in range(config.members)
+    )
+
+
+def _fold_steps(config: TrainConfig, folds: Sequence[Fold]) -> int:
+    """Steps of the heads of all folds, in all of their epochs."""
+    return config.coarse_epochs * sum(steps_per_epoch(config, sum(map(len, fold.training))) for fold in folds)
 
 
 def _planned_source(plan: PlannedCache, specs: Mapping[str, Spec]) -> PlannedSource:
