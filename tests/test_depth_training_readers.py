@@ -36,7 +36,7 @@ from slamdepth.training.readers.pairs import PairReader
 from slamdepth.types import Camera
 
 FR1 = (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)
-BENT = Camera(160, 120, 129.3, 129.1, 79.7, 63.8, FR1)
+DISTORTED = Camera(160, 120, 129.3, 129.1, 79.7, 63.8, FR1)
 
 
 def open_any(folder: Path, reader: str | None = None) -> data.Place:
@@ -121,7 +121,7 @@ def test_a_folder_of_pairs_that_cannot_be_read_is_named(
 
 
 def test_tum_pairs_by_time_and_undoes_the_lens(tmp_path: Path) -> None:
-    place = open_any(make_tum(tmp_path / "own_room", BENT))
+    place = open_any(make_tum(tmp_path / "own_room", DISTORTED))
     assert len(place) == 2  # the first image has no depth near it
     assert place.benchmark == "sequences in the TUM RGB-D layout"
     frame = place.read(1)
@@ -136,7 +136,7 @@ def test_tum_pairs_by_time_and_undoes_the_lens(tmp_path: Path) -> None:
 
 
 def test_image_and_depth_stay_together_through_the_lens(tmp_path: Path) -> None:
-    frame = open_any(make_tum(tmp_path / "room", BENT)).read(0)
+    frame = open_any(make_tum(tmp_path / "room", DISTORTED)).read(0)
     image, depth, _ = turned_view(frame, 84, 112, 30.0, 4.0, -3.0, 1.2, True)
     known = depth > 0
     assert known.mean() > 0.6
@@ -165,7 +165,7 @@ def test_synth_is_distinguished_from_tum(tmp_path: Path) -> None:
     assert place.read(0).depth_m is not None
     assert open_any(room, "tum").benchmark is not None
     with pytest.raises(DatasetError, match=r"no synth\.yaml here"):
-        open_any(make_tum(tmp_path / "tum", BENT), "synth")
+        open_any(make_tum(tmp_path / "tum", DISTORTED), "synth")
 
 
 def test_hypersim(tmp_path: Path) -> None:
@@ -269,14 +269,14 @@ def test_layouts_are_found_or_named(tmp_path: Path) -> None:
 
 
 def test_a_sequence_without_depth_is_refused(tmp_path: Path) -> None:
-    folder = make_tum(tmp_path / "room", BENT)
+    folder = make_tum(tmp_path / "room", DISTORTED)
     (folder / "depth.txt").unlink()
     with pytest.raises(DatasetError, match="has no sensor depth"):
         open_any(folder)
 
 
 def test_a_damaged_image_of_a_sequence_is_named(tmp_path: Path) -> None:
-    folder = make_tum(tmp_path / "room", BENT)
+    folder = make_tum(tmp_path / "room", DISTORTED)
     place = open_any(folder)
     (folder / "depth" / "1.png").write_bytes(b"x")
     with pytest.raises(DatasetError, match=r"1\.png: the image does not decode"):
@@ -331,7 +331,7 @@ def source_config(folder: Path, **source: object) -> TrainConfig:
 
 
 def test_benchmarks_trained_on_are_reported(tmp_path: Path) -> None:
-    make_tum(tmp_path / "rgbd_dataset_freiburg1_desk", BENT)
+    make_tum(tmp_path / "rgbd_dataset_freiburg1_desk", DISTORTED)
     make_place(tmp_path / "room")
     trained, held_out = [{"name": "rgbd_dataset_freiburg1_desk"}], ["rgbd_dataset_freiburg1_desk"]
     config = source_config(tmp_path, places=trained, held_out=["room"])
