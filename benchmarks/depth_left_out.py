@@ -13,7 +13,7 @@ from slamdepth.errors import ConfigError
 from slamdepth.training.config import TrainConfig, digest
 from slamdepth.training.data import data_folder
 
-DEFAULT_CONFIG = Path(__file__).resolve().parents[1] / "slamdepth" / "depth" / "configs" / "dinov2_head.yaml"
+DEFAULT_CONFIG = Path(__file__).resolve().parents[1] / "slamdepth/training/configs/dinov2_head.yaml"
 """The settings of the shipped head."""
 
 

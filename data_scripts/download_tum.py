@@ -4,12 +4,11 @@
 
     python data_scripts/download_tum.py fr1/desk fr1/rpy --output data
 
-An interrupted download goes on where it stopped. The benchmark publishes no checksums,
-so none are built in. What is checked instead: the size the server names, the CRC inside
-the gzip file, and a SHA-256 that is written to ``ARCHIVE.sha256`` after the first
-download and compared whenever the archive is used again. That record proves that an
-archive has not changed since, not that the first download was genuine; who knows the
-right SHA-256 passes it with ``--sha256``.
+An interrupted download resumes where it stopped. The benchmark publishes no checksums, so none are built
+in. Instead, the script checks the size given by the server, the CRC inside the gzip file, and a SHA-256 that
+is written to ``ARCHIVE.sha256`` after the first download and compared whenever the archive is used again.
+That record shows that an archive has not changed since, not that the first download was genuine. A known
+SHA-256 can be given with ``--sha256``.
 """
 
 from __future__ import annotations
@@ -55,22 +54,22 @@ SEQUENCES = {
 CHUNK_BYTES = 1 << 18
 
 OnProgress = Callable[[int, int | None], None]
-"""Called with the bytes there are and the bytes there will be, None where unknown."""
+"""Called with the bytes downloaded and the total, None if unknown."""
 
 
 class DownloadError(Exception):
-    """Something that ends the script with one line."""
+    """An error that ends the script with one line."""
 
 
 class _Interrupted(Exception):
-    """The connection broke; worth another attempt."""
+    """The connection failed; the download is attempted again."""
 
 
 def parse_sequence(name: str) -> tuple[str, str]:
     """Camera and full name of ``fr1/desk``, ``freiburg1_desk`` or ``rgbd_dataset_freiburg1_desk``.
 
     Raises:
-        DownloadError: it looks like none of these.
+        DownloadError: ``name`` has none of these forms.
     """
     found = re.fullmatch(r"(?:rgbd_dataset_)?(?:freiburg|fr)([123])[_/]([a-z0-9_]+)", name.strip().lower())
     if not found:
@@ -82,10 +81,10 @@ def parse_sequence(name: str) -> tuple[str, str]:
 def download(
     url: str, archive: Path, on_progress: OnProgress, *, attempts: int = 5, wait_s: float = 2.0
 ) -> None:
-    """Bring ``url`` to ``archive``, going on from ``archive.part`` where there is one.
+    """Download ``url`` to ``archive``, resuming from ``archive.part`` if it exists.
 
     Raises:
-        DownloadError: the server refuses, or ``attempts`` in a row bring nothing new.
+        DownloadError: the server refuses, or ``attempts`` in a row make no progress.
     """
     part = archive.with_name(archive.name + ".part")
     left = attempts
@@ -109,7 +108,7 @@ def _download_once(url: str, part: Path, on_progress: OnProgress) -> None:
     if have:
         headers["Range"] = f"bytes={have}-"
         if tag:
-            headers["If-Range"] = tag  # the server starts over where the file is another by now
+            headers["If-Range"] = tag  # the server starts over if the file has changed
     try:
         with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=60) as response:
             have, total = _accept(url, response, have)
@@ -135,7 +134,7 @@ def _download_once(url: str, part: Path, on_progress: OnProgress) -> None:
 
 
 def _accept(url: str, response: http.client.HTTPResponse, have: int) -> tuple[int, int | None]:
-    """Bytes to keep and bytes to expect in all, from the answer's headers."""
+    """Bytes to keep and total bytes to expect, from the response headers."""
     length = response.headers.get("Content-Length")
     if response.status != 206:
         return 0, int(length) if length else None
@@ -148,7 +147,7 @@ def _accept(url: str, response: http.client.HTTPResponse, have: int) -> tuple[in
 
 
 def _explain(url: str, part: Path, have: int, error: urllib.error.HTTPError) -> None:
-    """Raise what an HTTP error means; return where the part file is already whole."""
+    """Raise the error for an HTTP error; return if the part file is already complete."""
     if error.code == 416:
         found = re.fullmatch(r"bytes \*/(\d+)", error.headers.get("Content-Range", ""))
         if found and int(found[1]) == have:
@@ -175,18 +174,17 @@ def _read_tag(part: Path) -> str:
 
 
 def verify(archive: Path, expected_sha256: str | None) -> str:
-    """Check an archive's CRC and SHA-256, and record the latter on the first time.
+    """Check an archive's CRC and SHA-256, and record the latter the first time.
 
     Args:
         archive: the ``.tgz``.
-        expected_sha256: what it must be, or None to trust ``ARCHIVE.sha256`` or, without
-            one, this first sight.
+        expected_sha256: the required SHA-256, or None for the one in ``ARCHIVE.sha256``, if any.
 
     Returns:
         The SHA-256 in hexadecimal.
 
     Raises:
-        DownloadError: it is another file than expected, or damaged.
+        DownloadError: the archive has another SHA-256 or is damaged.
     """
     record = archive.with_name(archive.name + ".sha256")
     digest = _sha256(archive)
@@ -249,7 +247,7 @@ def fetch(
     keep_archive: bool = False,
     wait_s: float = 2.0,
 ) -> Path:
-    """Download, verify and unpack one sequence; a folder already there is left alone.
+    """Download, verify and unpack one sequence; an existing folder is not changed.
 
     Returns:
         The sequence's folder.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rooms furnished from catalogues of a thousand pieces, each at its real size.
 
-A room has a theme (office, living room, kitchen, bedroom, or anything): furniture stands along the walls
-and in the middle, things stand on whatever carries them, workplaces as those of
-``data_scripts/training_rooms.py`` are among it, windows, doors and pictures are on the walls; people, too.
+A room has a theme (office, living room, kitchen, bedroom, or anything). Furniture stands along the walls
+and in the middle, with things on it. There are workplaces as in ``data_scripts/training_rooms.py``, people,
+and windows, doors and prints on the walls.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from mesh_render import MeshScene
 from training_rooms import THINGS, UP, any_paint, block, colour, grey, timber, workplace
 
 from slamdepth.geometry import so3_exp
-from slamdepth.synth import paint as paint
-from slamdepth.synth import prints as printed
+from slamdepth.synth import paint, prints
 from slamdepth.synth.scene import Lamp
 from slamdepth.synth.shapes import Paint, Surface, quad
 
@@ -34,9 +33,9 @@ _THEMES = (
     {"Bedroom": 6.0, "Living room": 1.5, "Lights": 1.0, "Miscellaneous": 1.0},
     dict.fromkeys(_INDOORS, 1.0),
 )
-_ELSEWHERE = 0.15  # weight of categories that a theme does not name
+_OTHER_WEIGHT = 0.15  # of categories that a theme does not name
 _PEOPLE = 0.05  # share of the furniture
-_SMALL_M = 0.45  # what is no larger stands on other things
+_SMALL_M = 0.45  # pieces up to this size stand on others
 _LARGEST_M, _TALLEST_M = 3.5, 2.5
 _CARRIES_M = (0.35, 1.15)
 _HUNG_M = 0.3
@@ -44,11 +43,11 @@ _TRIES = 12
 _OVERLAP_M = 0.1
 _WORKPLACE = Piece("workplace", "Office", Path(), (1.8, 1.4, 1.3), 0.0, None)
 _WALLS = ((0.0, (0, 1)), (np.pi, (0, -1)), (np.pi / 2, (-1, 0)), (-np.pi / 2, (1, 0)))
-"""Turns that bring a piece's back (+y) to the wall in the direction beside it."""
+"""Rotations that put the back (+y) of a piece to a wall, and the direction of that wall."""
 
 
 def furnished_scene(seed: int, pieces: Sequence[Piece]) -> MeshScene:
-    """Room number ``seed``, z up, a corner of its floor at the origin."""
+    """Room number ``seed``, z up, with a corner of its floor at the origin."""
     rng = np.random.default_rng([seed, 19])
     room = np.array([rng.uniform(2.6, 7.0), rng.uniform(2.4, 6.0), rng.uniform(2.3, 3.1)])
     meshes, lamps = _shell(room, rng)
@@ -78,7 +77,7 @@ def furnished_scene(seed: int, pieces: Sequence[Piece]) -> MeshScene:
 
 
 class _Stock:
-    """What a room of one theme is furnished from."""
+    """The pieces available to a room of a random theme."""
 
     def __init__(self, pieces: Sequence[Piece], rng: np.random.Generator) -> None:
         theme = _THEMES[rng.integers(len(_THEMES))]
@@ -90,20 +89,20 @@ class _Stock:
         self._small = [p for p in indoors if max(p.size_m) <= _SMALL_M and p.elevation_m <= _HUNG_M]
         large = [p for p in indoors if max(p.size_m) > _SMALL_M]
         people = [p for p in pieces if p.category == "Characters" and _SMALL_M < p.size_m[2] < 2.0]
-        chance = np.array([theme.get(p.category, _ELSEWHERE) for p in large])
+        chance = np.array([theme.get(p.category, _OTHER_WEIGHT) for p in large])
         chance = np.append(
             chance / max(chance.sum(), 1e-9), np.full(len(people), _PEOPLE / max(len(people), 1))
         )
         self._large, self._chance = [*large, *people], chance / max(chance.sum(), 1e-9)
 
     def large(self) -> tuple[Piece, Mesh] | None:
-        """Something that stands on the floor or hangs; None where it has no mesh, or there is nothing."""
+        """A random piece that stands on the floor or hangs; None if it has no mesh or there is none."""
         return (
             _loaded(self._large[self._rng.choice(len(self._large), p=self._chance)]) if self._large else None
         )
 
     def small(self) -> tuple[Piece, Mesh] | None:
-        """The same of what stands on other things."""
+        """A random piece that stands on others; None if it has no mesh or there is none."""
         return _loaded(self._small[self._rng.integers(len(self._small))]) if self._small else None
 
 
@@ -115,7 +114,7 @@ def _loaded(piece: Piece) -> tuple[Piece, Mesh] | None:
 def _placed(
     piece: Piece, room: np.ndarray, taken: list[np.ndarray], at_wall: bool, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Turn ``(3, 3)`` and place ``(3,)`` where nothing else is, noted in ``taken``; None if there is none."""
+    """Rotation ``(3, 3)`` and position ``(3,)`` at a free place, added to ``taken``; None if not found."""
     is_hung = piece.elevation_m > _HUNG_M
     size = np.array(piece.size_m)
     for _ in range(_TRIES):
@@ -149,7 +148,7 @@ def _laden(
     stock: _Stock,
     rng: np.random.Generator,
 ) -> list[Mesh]:
-    """Things apart from one another on what has ``size_m`` and stands at ``place``, turned by ``A``."""
+    """Things with space between them on a top of ``size_m`` at ``place``, rotated by ``A``."""
     out: list[Mesh] = []
     spots: list[tuple[np.ndarray, float]] = []
     wanted = int(rng.integers(0, 5) + rng.poisson(9 * size_m[0] * size_m[1]))
@@ -176,7 +175,7 @@ def _laden(
 
 
 def _varied(mesh: Mesh, rng: np.random.Generator) -> Mesh:
-    """The same with some materials tinted, some of another colour."""
+    """``mesh`` with some of its materials tinted or replaced by a single colour."""
 
     def varied(material: Material) -> Material:
         kind = rng.random()
@@ -198,14 +197,14 @@ def _mesh(surface: Surface, rng: np.random.Generator) -> Mesh:
 
 
 def _tiled(surface: Surface, rng: np.random.Generator) -> Mesh:
-    """A wall, whose texture repeats."""
+    """A wall as triangles with a repeating texture."""
     side = int(_TILE_M / _TEXEL_M)
     image = surface.paint(rng, side, side, _TEXEL_M)
     return _textured(surface, image, np.array([[0.0, 0.0], surface.size_m]) / _TILE_M)
 
 
 def _textured(surface: Surface, image: np.ndarray, uv: np.ndarray) -> Mesh:
-    """``surface`` as triangles; ``uv (2, 2)`` are the points of ``image`` at its first and last corner."""
+    """``surface`` as triangles; ``uv (2, 2)`` are the texture coordinates of its first and last corner."""
     rows, columns = surface.points.shape[:2]
     u, v = np.linspace(*uv[:, 0], columns), np.linspace(*uv[:, 1], rows)
     at = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -217,7 +216,7 @@ def _textured(surface: Surface, image: np.ndarray, uv: np.ndarray) -> Mesh:
 
 @dataclass(frozen=True)
 class _Wall:
-    """A wall from floor to ceiling: where it starts, the unit vector along it, and into the room."""
+    """A wall from floor to ceiling: its start, and unit vectors along it and into the room."""
 
     start: np.ndarray
     along: np.ndarray
@@ -232,7 +231,7 @@ class _Wall:
         rng: np.random.Generator,
         emission: float = 0.0,
     ) -> Surface:
-        """Something flat anywhere along the wall, its lower edge at ``low_m``."""
+        """A flat surface at a random place along the wall, its lower edge at ``low_m``."""
         at = rng.uniform(0.05, max(self.length_m - size_m[0] - 0.05, 0.06))
         corner = self.start + at * self.along + UP * (low_m + size_m[1]) + 0.01 * self.inwards
         return replace(quad(corner, size_m[0] * self.along, -UP * size_m[1], what), emission=emission)
@@ -249,7 +248,7 @@ def _walls(room: np.ndarray) -> list[_Wall]:
 
 
 def _shell(room: np.ndarray, rng: np.random.Generator) -> tuple[list[Mesh], list[Lamp]]:
-    """Floor, ceiling, walls with windows, doors and pictures; and the lamps."""
+    """Floor, ceiling, walls with windows, doors and prints; and the lamps."""
     x, y, z = room
     floors = (paint.wood(timber(rng), plank_m=rng.uniform(0.06, 0.2)), paint.fabric(colour(rng, 0.1, 0.6)),
               paint.plain(grey(rng), contrast=0.06),
@@ -272,10 +271,10 @@ def _shell(room: np.ndarray, rng: np.random.Generator) -> tuple[list[Mesh], list
             lamps.append(lamp)
         for _ in range(int(rng.poisson(1.2))):
             size = (float(rng.uniform(0.2, 1.0)), float(rng.uniform(0.25, 0.9)))
-            what = printed.poster() if rng.random() < 0.6 else any_paint(rng)
+            what = prints.poster() if rng.random() < 0.6 else any_paint(rng)
             out.append(_mesh(wall.patch(float(rng.uniform(0.9, 1.5)), size, what, rng), rng))
         if rng.random() < 0.3 and wall.length_m > 1.2:
-            leaf = printed.door_leaf(colour(rng, 0.3, 0.95))
+            leaf = prints.door_leaf(colour(rng, 0.3, 0.95))
             out.append(_mesh(wall.patch(0.0, (0.9, 2.05), leaf, rng), rng))
     for _ in range(int(rng.integers(1, 4))):
         power = np.array([3.0, 2.75, 2.35]) * np.exp(rng.normal(-0.3, 0.5)) * np.exp(rng.normal(0, 0.1, 3))
@@ -286,9 +285,9 @@ def _shell(room: np.ndarray, rng: np.random.Generator) -> tuple[list[Mesh], list
 
 
 def _window(wall: _Wall, rng: np.random.Generator) -> tuple[list[Mesh], Lamp]:
-    """A bright pane in a frame, and the light that comes in."""
+    """A bright pane in a frame, and the lamp of its daylight."""
     size = (float(rng.uniform(0.8, min(2.4, wall.length_m - 0.4))), float(rng.uniform(0.8, 1.4)))
-    pane = wall.patch(0.85, size, printed.landscape(), rng, emission=float(rng.uniform(0.8, 2.5)))
+    pane = wall.patch(0.85, size, prints.landscape(), rng, emission=float(rng.uniform(0.8, 2.5)))
     middle = pane.points.mean(axis=(0, 1))
     frame = middle + 1.1 * (pane.points - middle) - 0.004 * wall.inwards
     day = np.array([3.4, 3.7, 4.2]) * size[0] * size[1] * rng.uniform(0.2, 1.4)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Furniture of the Sweet Home 3D libraries: a catalogue of real sizes, and OBJ meshes with pictures.
+"""Furniture of the Sweet Home 3D libraries: a catalogue of real sizes, and OBJ meshes with textures.
 
 Debian's packages ``sweethome3d`` (GPL) and ``sweethome3d-furniture`` (CC-BY 3.0, CC0) hold 1,000 models.
-Nothing needs to be installed; the folder that :func:`read_catalogues` wants is made by
+They need not be installed. To make the folder for :func:`read_catalogues`:
 
     apt-get download sweethome3d sweethome3d-furniture
     for file in *.deb; do dpkg -x $file unpacked; done
@@ -22,9 +22,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-_LARGEST_BYTES = 2_500_000  # an OBJ file beyond is finer than any view of it
-_LARGEST_PX = 256
-_SEEN_THROUGH = 0.6  # a material of less opacity is glass
+_MAX_OBJ_BYTES = 2_500_000  # larger meshes are finer than any view needs
+_MAX_TEXTURE_PX = 256
+_GLASS_OPACITY = 0.6  # materials of less opacity are left out as glass
 _ENTRY = re.compile(r"(\w+)#(\d+)=(.*)")
 
 
@@ -34,9 +34,9 @@ class Piece:
 
     Attributes:
         size_m: width, depth and height; its back is towards +y, its front towards -y.
-        elevation_m: of its base over the floor where it hangs, else 0.
-        top_m: height over its base at which things stand on it; None where nothing can.
-        rotation: ``(3, 3)`` to be applied to the model (y up) before it is brought to its size.
+        elevation_m: height of its base above the floor if it hangs, else 0.
+        top_m: height above its base at which things can stand on it, or None.
+        rotation: ``(3, 3)`` to be applied to the model (y up) before it is scaled.
     """
 
     name: str
@@ -50,11 +50,11 @@ class Piece:
 
 @dataclass(frozen=True)
 class Material:
-    """What a surface looks like.
+    """Appearance of a surface.
 
     Attributes:
         image: ``(h, w, 3)`` float32 sRGB 0 to 1; repeats.
-        emission: above 0 it glows: its image times this, unlit.
+        emission: above 0, the surface emits its image times this factor and is not lit.
     """
 
     image: np.ndarray
@@ -77,12 +77,12 @@ class Mesh:
     materials: tuple[Material, ...]
 
     def moved(self, A: np.ndarray, t: np.ndarray) -> Mesh:
-        """After the linear map ``A (3, 3)`` and the shift ``t (3,)``."""
+        """The mesh after the linear map ``A (3, 3)`` and the shift ``t (3,)``."""
         return Mesh(self.corners @ A.T + t, self.uv, self.material, self.materials)
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """All ``meshes`` in one."""
+    """All ``meshes`` as one."""
     starts = np.cumsum([0] + [len(m.materials) for m in meshes])
     return Mesh(
         np.concatenate([m.corners for m in meshes]).astype(np.float32),
@@ -112,7 +112,7 @@ def read_catalogues(folder: Path) -> list[Piece]:
 
 def _piece(root: Path, entry: dict[str, str]) -> Piece | None:
     model = root / entry.get("model", "").lstrip("/")
-    if not model.is_file() or model.suffix.lower() != ".obj" or model.stat().st_size > _LARGEST_BYTES:
+    if not model.is_file() or model.suffix.lower() != ".obj" or model.stat().st_size > _MAX_OBJ_BYTES:
         return None
     size = tuple(float(entry[key]) / 100 for key in ("width", "depth", "height"))
     top = float(entry.get("dropOnTopElevation", 100 * size[2])) / 100
@@ -126,7 +126,7 @@ def _piece(root: Path, entry: dict[str, str]) -> Piece | None:
 
 @functools.lru_cache(maxsize=300)
 def load_mesh(piece: Piece) -> Mesh | None:
-    """Its mesh at its size, centred over the origin; None where the file has no faces."""
+    """The mesh of ``piece`` at its real size, centred over the origin; None if the file has no faces."""
     text = piece.model.read_text(encoding="latin-1")
     corners, uv, names = _triangles(text)
     if not len(corners):
@@ -146,7 +146,7 @@ def load_mesh(piece: Piece) -> Mesh | None:
 
 
 def _triangles(text: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of an OBJ file: corners ``(T, 3, 3)``, their image points ``(T, 3, 2)`` and material names ``(T,)``."""
+    """Corners ``(T, 3, 3)``, texture coordinates ``(T, 3, 2)`` and material names ``(T,)`` of an OBJ file."""
     points: list[list[float]] = []
     images: list[list[float]] = [[0.0, 0.0]]
     triangles: list[tuple[int, ...]] = []
@@ -178,7 +178,7 @@ def _triangles(text: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _materials(text: str, folder: Path) -> dict[str, Material | None]:
-    """Of the MTL files in ``folder`` that an OBJ file names; None for what is seen through."""
+    """Materials of the MTL files named by an OBJ file; None for transparent ones."""
     found: dict[str, Material | None] = {}
     for name in re.findall(r"^mtllib (.+?)\s*$", text, re.MULTILINE):
         file = folder / name
@@ -187,20 +187,20 @@ def _materials(text: str, folder: Path) -> dict[str, Material | None]:
         for block in re.split(r"^newmtl ", file.read_text(encoding="latin-1"), flags=re.MULTILINE)[1:]:
             title, _, body = block.partition("\n")
             values = {w[0]: w[1:] for line in body.splitlines() if len(w := line.split()) > 1}
-            if float(values.get("d", ["1"])[0]) < _SEEN_THROUGH:
+            if float(values.get("d", ["1"])[0]) < _GLASS_OPACITY:
                 found[title.strip()] = None
                 continue
             colour = np.array(values.get("Kd", ["0.6"] * 3)[:3], dtype=np.float32)
-            image = _picture(file.parent / " ".join(values["map_Kd"])) if "map_Kd" in values else None
+            image = _texture(file.parent / " ".join(values["map_Kd"])) if "map_Kd" in values else None
             plain = np.clip(colour, 0.02, 0.95).reshape(1, 1, 3)
             found[title.strip()] = Material(plain if image is None else image)
     return found
 
 
-def _picture(path: Path) -> np.ndarray | None:
+def _texture(path: Path) -> np.ndarray | None:
     data = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
     if data is None:
         return None
-    shrink = min(1.0, _LARGEST_PX / max(data.shape[:2]))
+    shrink = min(1.0, _MAX_TEXTURE_PX / max(data.shape[:2]))
     data = cv2.resize(data, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA) if shrink < 1 else data
     return (data[:, :, ::-1] / 255.0).astype(np.float32)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs of a room of triangle meshes: rays from Open3D, area lamps, occluded ambient light.
+"""Rendering of a room of triangle meshes: rays by Open3D, area lamps, ambient light with occlusion.
 
-Light is computed where a view's rays arrive, so a room costs nothing before its first view.
+Light is computed only at the points seen in a view, so a room costs nothing before its first view.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from slamdepth.types import Camera
 _LAMP_SAMPLES = 4
 _AMBIENT_SAMPLES = 6
 _AMBIENT_REACH_M = 1.0
-_FINER = 2  # rays a pixel's side for colour
+_SUPERSAMPLING = 2  # colour rays along a pixel side
 _LEVELS = 7
 _SPARSE = 37
 _FEW_RAYS = 8
@@ -29,7 +29,7 @@ _FEW_RAYS = 8
 
 @dataclass(frozen=True)
 class MeshScene:
-    """A room: its triangles and what lights it."""
+    """A room: its triangles, lamps and ambient light."""
 
     mesh: Mesh
     lamps: list[Lamp]
@@ -37,7 +37,7 @@ class MeshScene:
 
 
 class MeshRenderer:
-    """Renders one scene with one camera; ``seed`` is that of light and exposure."""
+    """Renders one scene with one camera; ``seed`` is for light sampling and exposure."""
 
     def __init__(self, scene: MeshScene, camera: Camera, seed: int) -> None:
         o3d = import_open3d()
@@ -62,13 +62,13 @@ class MeshRenderer:
         self._emission = np.array([material.emission for material in scene.mesh.materials])
 
     def depth(self, T_world_camera: np.ndarray) -> np.ndarray:
-        """Depth along z ``(H, W)`` in metres; infinite where there is nothing."""
+        """Depth along z ``(H, W)`` in metres; infinite where nothing is hit."""
         rays = self._rays(T_world_camera, 1)
         depth: np.ndarray = self._cast(rays)["t_hit"].numpy()
         return depth.reshape(self._camera.height, self._camera.width)
 
     def materials_seen(self, T_world_camera: np.ndarray) -> int:
-        """How many different materials a view shows on more than a few of its rays."""
+        """Number of different materials that more than a few rays of a view hit."""
         rays = self._rays(T_world_camera, 1)[::_SPARSE]
         hit = self._cast(rays)["primitive_ids"].numpy()
         hit = hit[hit < len(self._scene.mesh.material)]
@@ -82,11 +82,11 @@ class MeshRenderer:
         depth = hits["t_hit"].numpy()
         light = self._light(rays, depth, hits["primitive_ids"].numpy()).reshape(height, width, 3)
         light = cv2.blur(light.astype(np.float32), (3, 3))
-        fine = self._cast(self._rays(T_world_camera, _FINER))
+        fine = self._cast(self._rays(T_world_camera, _SUPERSAMPLING))
         albedo, glow = self._albedo(
             fine["primitive_ids"].numpy(), fine["primitive_uvs"].numpy(), fine["t_hit"].numpy()
         )
-        shape = (height * _FINER, width * _FINER)
+        shape = (height * _SUPERSAMPLING, width * _SUPERSAMPLING)
         light = cv2.resize(light, shape[::-1], interpolation=cv2.INTER_LINEAR)
         linear = albedo.reshape(*shape, 3) ** 2.2
         linear = np.where(glow.reshape(*shape, 1) > 0, linear * glow.reshape(*shape, 1), linear * light)
@@ -98,7 +98,7 @@ class MeshRenderer:
         return self._raycaster.cast_rays(import_open3d().core.Tensor(rays))
 
     def _rays(self, T_world_camera: np.ndarray, finer: int) -> np.ndarray:
-        """Rays ``(N, 6)`` of unit z through ``finer`` points a pixel's side."""
+        """Rays ``(N, 6)`` of unit z through ``finer`` points along each pixel side."""
         camera = self._camera
         step = (np.arange(finer) + 0.5) / finer - 0.5
         u = (np.arange(camera.width)[:, None] + step).ravel()
@@ -109,7 +109,7 @@ class MeshRenderer:
         return np.concatenate([origins, directions], axis=1).astype(np.float32)
 
     def _light(self, rays: np.ndarray, depth: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-        """Irradiance ``(N, 3)`` where the rays arrive."""
+        """Irradiance ``(N, 3)`` at the points hit by the rays."""
         hit = np.isfinite(depth)
         out = np.ones((len(rays), 3))
         directions = rays[hit, 3:]
@@ -140,14 +140,14 @@ class MeshRenderer:
     def _albedo(
         self, triangle: np.ndarray, barycentric: np.ndarray, depth: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """sRGB ``(N, 3)`` and emission ``(N,)`` of what the rays hit."""
+        """sRGB ``(N, 3)`` and emission ``(N,)`` at the points hit by the rays."""
         mesh = self._scene.mesh
         colour, glow = np.full((len(triangle), 3), 0.8, np.float32), np.zeros(len(triangle), np.float32)
         hit = np.flatnonzero(np.isfinite(depth))
         t = triangle[hit]
         a, b = barycentric[hit, :1], barycentric[hit, 1:]
         uv = mesh.uv[t, 0] * (1 - a - b) + mesh.uv[t, 1] * a + mesh.uv[t, 2] * b
-        footprint_m = depth[hit] / (self._camera.fx * _FINER)
+        footprint_m = depth[hit] / (self._camera.fx * _SUPERSAMPLING)
         level = np.log2(np.maximum(footprint_m / self._texel_m[t], 1.0)).round().astype(int)
         group = mesh.material[t] * _LEVELS + np.minimum(level, _LEVELS - 1)
         order = np.argsort(group, kind="stable")
@@ -160,7 +160,7 @@ class MeshRenderer:
         return colour, glow
 
     def _developed(self, linear: np.ndarray) -> np.ndarray:
-        """Exposed as a camera would, or a little too long or short; highlights burn out."""
+        """sRGB 0 to 1 after a random exposure near the right one and tone mapping; highlights clip."""
         middle = float(np.median(linear.mean(axis=-1)))
         exposure = np.exp(self._rng.normal(0.0, 0.45)) * 0.3 / max(middle, 0.01)
         knee = self._rng.uniform(0.0, 0.5)
@@ -169,7 +169,7 @@ class MeshRenderer:
 
 
 def _smaller(image: np.ndarray) -> list[np.ndarray]:
-    """``image`` and its halves."""
+    """``image`` and its mip levels."""
     out = [image]
     while len(out) < _LEVELS and min(out[-1].shape[:2]) >= 2:
         half = (out[-1].shape[1] // 2, out[-1].shape[0] // 2)

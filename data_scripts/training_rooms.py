@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic rooms for training, as unlike one another as can be while sizes stay true.
+"""Synthetic rooms for training, as diverse as possible with true sizes.
 
-The rooms of ``slamdepth synth`` taken apart: walls stretched and painted anew, furniture
-moved, turned, resized or left out; then workplaces with screens, keyboards, paper and
-crockery at their real sizes, since it is by known sizes that a network can tell metres.
+They are rooms of ``slamdepth synth`` with walls stretched and repainted, and furniture moved, rotated,
+resized or left out. Workplaces with screens, keyboards, paper and crockery at their real sizes are added,
+since known sizes are what gives a network metric scale.
 """
 
 from __future__ import annotations
@@ -14,24 +14,22 @@ from dataclasses import replace
 import numpy as np
 
 from slamdepth.geometry import so3_exp
-from slamdepth.synth import furniture as furniture
-from slamdepth.synth import paint as paint
-from slamdepth.synth import prints as printed
-from slamdepth.synth import scene as synth_scene
+from slamdepth.synth import furniture, paint, prints
+from slamdepth.synth.scene import ROOM_M, Lamp, Scene, build_scene, door, framed_prints, shell, window
 from slamdepth.synth.shapes import Paint, Surface, box, cylinder, ellipsoid, lathe
 
 UP = np.array([0.0, 0.0, 1.0])
 _GROUPS = ("desk", "bookshelf", "sofa", "cabinet", "rug_and_table", "plant", "corners")
-_WALL_M = 2.2  # what is longer is wall, floor or ceiling
+_WALL_M = 2.2  # longer surfaces are wall, floor or ceiling
 _REPAINTED = 0.3  # share of a group's surfaces that get another material
 _DARK, _PALE = paint.plain((0.07, 0.07, 0.08), contrast=0.06), paint.plain((0.86, 0.85, 0.83))
 
 
-def varied_scene(seed: int) -> synth_scene.Scene:
+def varied_scene(seed: int) -> Scene:
     """Room number ``seed``: its surfaces (z up, metres, corner at the origin) and lamps."""
     rng = np.random.default_rng([seed, 13])
     stretch = np.array([rng.uniform(0.6, 1.5), rng.uniform(0.7, 1.6), rng.uniform(0.9, 1.2)])
-    room = np.array(synth_scene.ROOM_M) * stretch
+    room = np.array(ROOM_M) * stretch
     surfaces = [moved(s, np.diag(stretch), np.zeros(3)) for s in _shell(rng)]
     for name in _GROUPS:
         if rng.random() < 0.4:
@@ -43,7 +41,7 @@ def varied_scene(seed: int) -> synth_scene.Scene:
         middle = (points.min(axis=0) + points.max(axis=0)) / 2 * [1, 1, 0]
         A = so3_exp(UP * rng.uniform(-np.pi, np.pi)) * rng.uniform(0.9, 1.1)
         place = np.append(rng.uniform(0.15, 0.85, 2) * room[:2], 0.0)
-        if rng.random() < 0.35:  # against its wall, where it belongs
+        if rng.random() < 0.35:  # at its wall, as in the original room
             A, place = np.eye(3), middle * stretch
         surfaces += [moved(s, A, place - A @ middle) for s in group]
     for _ in range(rng.integers(1, 4)):
@@ -53,13 +51,13 @@ def varied_scene(seed: int) -> synth_scene.Scene:
     for _ in range(rng.integers(0, 10)):
         place = np.append(rng.uniform(0.08, 0.92, 2) * room[:2], 0.0)
         surfaces += [moved(s, np.eye(3), place) for s in block(rng, 0.3)]
-    return synth_scene.Scene(surfaces, _lamps(rng, seed, stretch))
+    return Scene(surfaces, _lamps(rng, seed, stretch))
 
 
-def plain_scene(seed: int) -> synth_scene.Scene:
-    """Room ``seed`` as offices and new flats are: walls white, much of the rest of one colour.
+def simple_scene(seed: int) -> Scene:
+    """Room ``seed`` with little texture, as offices and new flats: white walls and single colours.
 
-    How much is drawn by room, from a third of all surfaces to all of them; what glows stays.
+    The share of repainted surfaces is random, from a third to all. Surfaces that emit light stay.
     """
     rng = np.random.default_rng([seed, 17])
     scene = varied_scene(seed)
@@ -84,12 +82,12 @@ def plain_scene(seed: int) -> synth_scene.Scene:
 
 
 def moved(surface: Surface, A: np.ndarray, t: np.ndarray) -> Surface:
-    """``surface`` after the linear map ``A`` and the shift ``t``; its texture stretches along."""
+    """``surface`` after the linear map ``A (3, 3)`` and the shift ``t (3,)``; its texture stretches too."""
     return replace(surface, points=surface.points @ A.T + t)
 
 
 def workplace(rng: np.random.Generator) -> list[Surface]:
-    """A table about the origin with the things of an office or kitchen on it, and chairs."""
+    """A table at the origin with things of an office or kitchen on it, and chairs."""
     width, depth, height = rng.uniform(0.9, 2.0), rng.uniform(0.6, 1.0), rng.uniform(0.70, 0.78)
     top = [paint.wood(timber(rng)), paint.plain(grey(rng, 0.6, 0.95)), paint.plain(grey(rng))]
     out = box(
@@ -112,8 +110,8 @@ def workplace(rng: np.random.Generator) -> list[Surface]:
 
 
 def _shell(rng: np.random.Generator) -> list[Surface]:
-    """Walls, floor, ceiling, window, door and pictures; most of them painted as offices are."""
-    out = [*synth_scene._shell(rng)]
+    """Walls, floor, ceiling, window, door and framed prints, most of them painted as in offices."""
+    out = [*shell(rng)]
     floors = [paint.wood(timber(rng), plank_m=rng.uniform(0.06, 0.2)),
               paint.fabric(colour(rng, 0.1, 0.6)), paint.plain(grey(rng), contrast=0.06),
               paint.checker(grey(rng), grey(rng), float(rng.uniform(0.2, 0.5)))]  # fmt: skip
@@ -124,14 +122,14 @@ def _shell(rng: np.random.Generator) -> list[Surface]:
             plain = paint.plain(grey(rng, 0.55, 0.95), contrast=0.02)
             wall = [plain, plain, paint.plaster(colour(rng, 0.5, 0.95)), paint.wood(timber(rng))]
             out[k] = replace(out[k], paint=wall[rng.integers(len(wall))])
-    for group in (synth_scene._window(), synth_scene._door(), synth_scene._pictures(rng)):
+    for group in (window(), door(), framed_prints(rng)):
         if rng.random() < 0.75:
             out += group
     return out
 
 
-def _lamps(rng: np.random.Generator, seed: int, stretch: np.ndarray) -> list[synth_scene.Lamp]:
-    base = synth_scene.build_scene(seed, "rich").lamps
+def _lamps(rng: np.random.Generator, seed: int, stretch: np.ndarray) -> list[Lamp]:
+    base = build_scene(seed, "rich").lamps
     common = np.exp(rng.normal(0.1, 0.4))
     return [
         replace(
@@ -164,20 +162,22 @@ def timber(rng: np.random.Generator) -> paint.Colour:
 
 
 def grey(rng: np.random.Generator, low: float = 0.05, high: float = 0.95) -> paint.Colour:
+    """A nearly grey colour."""
     r, g, b = np.clip(rng.uniform(low, high) * np.exp(rng.normal(0, 0.05, 3)), 0.02, 0.97)
     return (float(r), float(g), float(b))
 
 
 def any_paint(rng: np.random.Generator) -> Paint:
+    """A random material."""
     of = colour(rng)
-    paints = [paint.plain(of), paint.plain(grey(rng)), printed.book(of), printed.cardboard(),
-              printed.poster(), paint.fabric(of), paint.wood(timber(rng)),
-              printed.page()]  # fmt: skip
+    paints = [paint.plain(of), paint.plain(grey(rng)), prints.book(of), prints.cardboard(),
+              prints.poster(), paint.fabric(of), paint.wood(timber(rng)),
+              prints.page()]  # fmt: skip
     return paints[rng.integers(len(paints))]
 
 
 def block(rng: np.random.Generator, size_m: float) -> list[Surface]:
-    """A box, cylinder or ball of any material: sizes that say nothing, shapes that do."""
+    """A box, cylinder or ball of any material, at a random size."""
     kind, chosen = rng.random(), any_paint(rng)
     sx, sy, sz = size_m * np.exp(rng.uniform(-0.9, 0.9, 3))
     if kind < 0.5:
@@ -191,7 +191,7 @@ def _monitor(rng: np.random.Generator) -> list[Surface]:
     w, h, foot = rng.uniform(0.40, 0.68), rng.uniform(0.28, 0.40), rng.uniform(0.06, 0.16)
     case = _DARK if rng.random() < 0.75 else _PALE
     out = box((-w / 2, -0.02, foot), (w, 0.04, h), case, bottom=True)
-    face = box((-w / 2 + 0.015, -0.022, foot + 0.015), (w - 0.03, 0.004, h - 0.03), printed.screen())
+    face = box((-w / 2 + 0.015, -0.022, foot + 0.015), (w - 0.03, 0.004, h - 0.03), prints.screen())
     glow = rng.uniform(0.5, 1.3) if rng.random() < 0.5 else 0.0
     out += [replace(s, emission=glow, paint=s.paint if glow else _DARK) for s in face]
     return (
@@ -202,13 +202,13 @@ def _monitor(rng: np.random.Generator) -> list[Surface]:
 
 
 def _keyboard(rng: np.random.Generator) -> list[Surface]:
-    return box((-0.22, -0.07, 0.0), (0.44, 0.14, 0.02), {"+z": printed.keyboard(), "*": _DARK})
+    return box((-0.22, -0.07, 0.0), (0.44, 0.14, 0.02), {"+z": prints.keyboard(), "*": _DARK})
 
 
 def _laptop(rng: np.random.Generator) -> list[Surface]:
     case = paint.plain(grey(rng, 0.05, 0.75))
-    out = box((-0.17, -0.12, 0.0), (0.34, 0.24, 0.02), {"+z": printed.keyboard(), "*": case})
-    lid = box((-0.17, 0.0, 0.0), (0.34, 0.01, 0.23), {"-y": printed.screen(), "*": case})
+    out = box((-0.17, -0.12, 0.0), (0.34, 0.24, 0.02), {"+z": prints.keyboard(), "*": case})
+    lid = box((-0.17, 0.0, 0.0), (0.34, 0.01, 0.23), {"-y": prints.screen(), "*": case})
     A = so3_exp(np.array([-rng.uniform(0.1, 0.5), 0.0, 0.0]))
     return out + [moved(s, A, np.array([0.0, 0.12, 0.015])) for s in lid]
 
@@ -217,7 +217,7 @@ def _paper(rng: np.random.Generator) -> list[Surface]:
     out: list[Surface] = []
     for k in range(rng.integers(1, 5)):
         low = (-0.105 + rng.normal(0, 0.08), -0.15 + rng.normal(0, 0.08), 0.003 * k)
-        out += box(low, (0.21, 0.297, 0.003), {"+z": printed.page(), "*": _PALE}, yaw=rng.uniform(-1.5, 1.5))
+        out += box(low, (0.21, 0.297, 0.003), {"+z": prints.page(), "*": _PALE}, yaw=rng.uniform(-1.5, 1.5))
     return out
 
 
@@ -225,7 +225,7 @@ def _books(rng: np.random.Generator) -> list[Surface]:
     out, z = [], 0.0
     for _ in range(rng.integers(1, 6)):
         w, d, thick = rng.uniform(0.12, 0.22), rng.uniform(0.18, 0.30), rng.uniform(0.01, 0.05)
-        cover = {"+z": printed.poster(), "-y": printed.book(colour(rng)), "*": _PALE}
+        cover = {"+z": prints.poster(), "-y": prints.book(colour(rng)), "*": _PALE}
         out += box((-w / 2, -d / 2, z), (w, d, thick), cover, yaw=rng.uniform(-0.4, 0.4))
         z += thick
     return out
@@ -234,7 +234,7 @@ def _books(rng: np.random.Generator) -> list[Surface]:
 def _binders(rng: np.random.Generator) -> list[Surface]:
     out: list[Surface] = []
     for k in range(rng.integers(1, 6)):
-        sides = {"-y": printed.book(colour(rng)), "*": paint.plain(colour(rng))}
+        sides = {"-y": prints.book(colour(rng)), "*": paint.plain(colour(rng))}
         out += box((0.08 * k, -0.14, 0.0), (0.075, 0.28, 0.32), sides)
     return out
 

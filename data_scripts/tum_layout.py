@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the converters share: writing a sequence in the TUM layout, whole or not at all."""
+"""Common parts of the converters: write a sequence in TUM layout, whole or not at all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slamdepth.datasets import CAMERA_FILE, write_camera
+from slamdepth.calibration import CAMERA_FILE
+from slamdepth.datasets import write_camera
 from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.io import format_timestamp, read_depth_raw, write_text, write_tum_trajectory
 from slamdepth.types import Camera, Trajectory
@@ -46,13 +47,13 @@ def write_sequence(
         camera: goes to ``camera.yaml``; depth keeps its raw units.
         ground_truth: camera-to-world poses, or None.
         link: link to the original images instead of copying them.
-        unknown_raw: raw depth values that become 0, which is TUM's only unknown; such an
-            image is written anew, without loss.
+        unknown_raw: raw depth values that become 0, the only unknown value of the TUM layout; such an
+            image is encoded again, without loss.
 
     Raises:
         DatasetError: the output folder has something in it.
         OutputError: it cannot be written; nothing is left behind.
-        ImageDecodeError: a depth image to look into does not decode.
+        ImageDecodeError: a depth image does not decode.
     """
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise DatasetError(f"{output}: is there already and not empty; delete it or name another folder")
@@ -94,7 +95,7 @@ def _place(source: Path, target: Path, link: bool) -> None:
 
 
 def _write_without(unknown_raw: Sequence[int], source: Path, target: Path) -> bool:
-    """Write ``source`` with ``unknown_raw`` values at 0; False, and no file, where it has none."""
+    """Write ``source`` with ``unknown_raw`` values set to 0; False, and no file, if it has none."""
     if not unknown_raw:
         return False
     raw = read_depth_raw(source)

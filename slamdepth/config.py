@@ -23,7 +23,7 @@ class _Section(BaseModel):
 
 
 class FeatureConfig(_Section):
-    """Keypoints and descriptors; other features than ORB have levels and thresholds of their own."""
+    """Keypoints and descriptors; features other than ORB have levels and thresholds of their own."""
 
     name: str = Field("orb", description="feature by its registered name")
     count: int = Field(1000, ge=100, le=10000, description="keypoints kept per frame")
@@ -31,7 +31,7 @@ class FeatureConfig(_Section):
     scale_factor: float = Field(1.2, gt=1.0, le=2.0, description="ratio of one level of ORB to the next")
     fast_threshold: int = Field(20, ge=1, le=100, description="contrast of ORB's corners, grey values")
     fast_threshold_low: int = Field(
-        7, ge=1, le=100, description="the same in images that have too few such corners"
+        7, ge=1, le=100, description="contrast of ORB's corners in images with too few stronger ones"
     )
     weights: str | None = Field(None, min_length=1, description="ONNX file of a feature that is a network")
     matcher: str | None = Field(
@@ -44,12 +44,17 @@ class TrackingConfig(_Section):
 
     min_inliers: int = Field(20, ge=6, description="fewer agreeing points and the frame is lost")
     keyframe_overlap: float = Field(
-        0.55, gt=0, lt=1, description="a keyframe is made when less of the last one is still seen"
+        0.55, gt=0, lt=1, description="a keyframe is made when a smaller share of the last one is in view"
     )
     keyframe_overlap_start: float = Field(
-        0.85, gt=0, lt=1, description="the same for the first keyframes, which triangulate the first points"
+        0.85,
+        gt=0,
+        lt=1,
+        description="keyframe_overlap of the first keyframes, which triangulate the first points",
     )
-    keyframe_min_inliers: int = Field(100, ge=0, description="... or when fewer points agree")
+    keyframe_min_inliers: int = Field(
+        100, ge=0, description="a keyframe is also made when fewer points agree"
+    )
     local_keyframes: int = Field(12, ge=2, description="keyframes whose points are searched for")
     depth_delay: int = Field(
         10, ge=0, le=30, description="frames after a keyframe until its predicted depth joins the map"
@@ -63,8 +68,8 @@ class ShutterConfig(_Section):
         None,
         ge=-50,
         le=50,
-        description="milliseconds from an image's first row to its last; 0 for a global shutter, null to "
-        "find it out",
+        description="milliseconds from an image's first row to its last; 0 for a global shutter, null "
+        "estimates it",
     )
 
 
@@ -72,13 +77,13 @@ class BundleConfig(_Section):
     """Local and global bundle adjustment."""
 
     window: int = Field(8, ge=2, description="keyframes adjusted together after each new one")
-    fixed: int = Field(6, ge=1, description="further keyframes that hold the window in place")
+    fixed: int = Field(6, ge=1, description="further keyframes, with fixed poses, that constrain the window")
     local: bool = Field(True, description="adjust a window after each new keyframe")
     final: bool = Field(True, description="adjust the whole map once at the end")
     prior_inflation: float = Field(
         6.0,
         ge=1,
-        description="predicted depths of neighbouring pixels err together, so each counts this much less",
+        description="factor on the deviation of predicted depths: errors of neighbours are correlated",
     )
     scale_sigma: float = Field(0.1, ge=0, description="deviation of a keyframe's common relative depth error")
 
@@ -101,22 +106,22 @@ class DepthConfig(_Section):
     min_m: float = Field(0.1, gt=0, description="nearer depth is dropped")
     max_m: float = Field(10.0, gt=0, description="farther depth is dropped")
     uncertainty: bool = Field(
-        True, description="weigh predictions by what the model says of their errors, not all alike"
+        True, description="weigh predictions by the model's own uncertainty, not all alike"
     )
     max_sigma_log: float = Field(
-        1.0, gt=0, description="pixels whose log depth is less sure than this never become map points"
+        1.0, gt=0, description="pixels whose log depth has a larger deviation do not become landmarks"
     )
 
 
 GROUND_TRUTH = "groundtruth"
-"""The word that takes the scale from what a sequence is judged by."""
+"""The value of ``scale.depth`` that takes the scale from a sequence's ground truth."""
 
 _FILES = (("depth", "weights"), ("scale", "depth"), ("features", "weights"), ("features", "matcher"))
 """Settings that may name a file."""
 
 
 class ScaleConfig(_Section):
-    """What is known of the scale beside the depth model's own; see ``slamdepth.pipeline.scale``."""
+    """Knowledge of the scale other than the depth model's; see ``slamdepth.pipeline.scale``."""
 
     depth: float | str | None = Field(
         None,
@@ -126,7 +131,7 @@ class ScaleConfig(_Section):
         None, gt=0, le=100, description="height of the first camera over the floor in metres"
     )
     baseline_m: float | None = Field(
-        None, gt=0, le=1e5, description="distance in metres between the camera's places at two times"
+        None, gt=0, le=1e5, description="distance in metres between the camera's positions at two times"
     )
     baseline_between_s: tuple[float, float] | None = Field(
         None, description="those two times, in seconds of the sequence; null: first and last placed frame"
@@ -163,17 +168,17 @@ class ScaleConfig(_Section):
 
 
 class MapConfig(_Section):
-    """What is kept of the keyframes, TSDF fusion and the mesh."""
+    """Memory of keyframes, TSDF fusion and the mesh."""
 
     keyframe_memory_mib: float = Field(
         256.0,
         ge=0,
-        description="images and depth maps of keyframes beyond so many MiB wait in a temporary file",
+        description="images and depth maps of keyframes beyond this many MiB are spilled to a temporary file",
     )
     voxel_size_m: float = Field(0.02, gt=0, le=1.0, description="edge of a voxel in metres")
     max_depth_m: float = Field(4.0, gt=0, description="depth beyond this is not fused")
     min_component_triangles: int = Field(
-        200, ge=0, description="connected specks of the mesh with fewer triangles are removed"
+        200, ge=0, description="connected components of the mesh with fewer triangles are removed"
     )
 
 
@@ -237,7 +242,7 @@ class Config(_Section):
         return yaml.safe_dump(values, sort_keys=False)
 
     def for_report(self) -> dict[str, Any]:
-        """The settings as nested plain values; of files only the names: a report is passed on."""
+        """The settings as nested dicts; files by their names only, as reports are passed on."""
         return self._with_files(lambda name: Path(name).name)
 
     def _with_files(self, named: Callable[[str], str]) -> dict[str, Any]:

@@ -14,11 +14,14 @@ import numpy as np
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
+CHI2_2DOF_95 = 5.991
+"""95 % of the squared whitened errors of a pixel are smaller: chi-square with two degrees of freedom."""
+
 
 def invert(T: Floats) -> Floats:
     """Inverse of rigid transforms ``(..., 4, 4)``."""
     R = T[..., :3, :3]
-    inverse = np.zeros_like(T)
+    inverse: Floats = np.zeros_like(T)
     inverse[..., :3, :3] = np.swapaxes(R, -1, -2)
     inverse[..., :3, 3] = -np.einsum("...ji,...j->...i", R, T[..., :3, 3])
     inverse[..., 3, 3] = 1.0
@@ -27,13 +30,14 @@ def invert(T: Floats) -> Floats:
 
 def transform(T_a_b: Floats, points_b: Floats) -> Floats:
     """Points ``(N, 3)`` of frame b in frame a."""
-    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    points_a: Floats = points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return points_a
 
 
 def skew(v: Floats) -> Floats:
     """Cross product matrices ``(..., 3, 3)`` of vectors ``(..., 3)``."""
     v = np.asarray(v, dtype=np.float64)
-    out = np.zeros((*v.shape[:-1], 3, 3))
+    out: Floats = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
     out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
     out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
@@ -52,11 +56,12 @@ def so3_exp(omega: Floats) -> Floats:
     a = np.where(small, 1.0 - theta2 / 6.0, np.sin(safe) / safe)
     b = np.where(small, 0.5 - theta2 / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
     W = skew(omega)
-    return np.eye(3) + a * W + b * (W @ W)
+    R: Floats = np.eye(3) + a * W + b * (W @ W)
+    return R
 
 
 def _so3_exp_single(x: float, y: float, z: float) -> Floats:
-    """:func:`so3_exp` of one vector, which optimisers need a dozen times a frame, in plain numbers."""
+    """Rotation matrix ``(3, 3)`` of one rotation vector, in scalar arithmetic, which is faster for one."""
     xx, yy, zz = x * x, y * y, z * z
     theta2 = xx + yy + zz
     if theta2 < 1e-12:
@@ -108,7 +113,8 @@ def se3_log(T: Floats) -> Floats:
 
 def rotation_angle_rad(R: Floats) -> Floats:
     """Angles ``(...)`` in radians of rotation matrices ``(..., 3, 3)``."""
-    return np.linalg.norm(so3_log(R), axis=-1)
+    angles: Floats = np.linalg.norm(so3_log(R), axis=-1)
+    return angles
 
 
 def orthonormalised(T: Floats) -> Floats:
@@ -117,9 +123,24 @@ def orthonormalised(T: Floats) -> Floats:
     det = np.linalg.det(U @ Vt)
     U = U.copy()
     U[..., :, 2] *= det[..., None]
-    out = T.copy()
+    out: Floats = T.copy()
     out[..., :3, :3] = U @ Vt
     return out
+
+
+def look_at(eye_w: Floats, target_w: Floats, down_w: Floats) -> Floats:
+    """``T_world_camera (4, 4)`` of a level camera at ``eye_w (3,)`` with ``target_w (3,)`` in its centre.
+
+    Args:
+        down_w: ``(3,)`` direction of gravity, not parallel to the view.
+    """
+    T = np.eye(4)
+    ahead = (target_w - eye_w) / np.linalg.norm(target_w - eye_w)
+    right = np.cross(down_w, ahead)
+    right /= np.linalg.norm(right)
+    T[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    T[:3, 3] = eye_w
+    return T
 
 
 def quat_xyzw_to_rotation(quat_xyzw: Floats) -> Floats:
@@ -149,7 +170,7 @@ def quat_xyzw_to_rotation(quat_xyzw: Floats) -> Floats:
 def rotation_to_quat_xyzw(R: Floats) -> Floats:
     """Quaternions ``(..., 4)`` x y z w with w >= 0 of rotation matrices ``(..., 3, 3)``.
 
-    By the largest of the four candidates (Shepperd 1978), so never by a small divisor.
+    Divides by the largest of the four candidates (Shepperd 1978), never by a small number.
     """
     R = np.asarray(R, dtype=np.float64)
     m = R.reshape(-1, 3, 3)
@@ -171,7 +192,8 @@ def rotation_to_quat_xyzw(R: Floats) -> Floats:
     quat = candidates[np.arange(len(m)), largest]
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     quat *= np.where(quat[:, 3:] < 0, -1.0, 1.0)
-    return quat.reshape(*R.shape[:-2], 4)
+    quat_xyzw: Floats = quat.reshape(*R.shape[:-2], 4)
+    return quat_xyzw
 
 
 def project(camera: Camera, points_c: Floats) -> tuple[Floats, Floats]:
@@ -186,6 +208,23 @@ def project(camera: Camera, points_c: Floats) -> tuple[Floats, Floats]:
     u = camera.fx * points_c[:, 0] / safe + camera.cx
     v = camera.fy * points_c[:, 1] / safe + camera.cy
     return np.stack([u, v], axis=1), z
+
+
+def reprojection_errors(camera: Camera, points_c: Floats, px: Floats, nearest_m: float) -> Floats:
+    """Projections less measured pixels, ``(2, N)``, without distortion.
+
+    Arrays are by coordinate, for optimisers: NumPy is fast at a few long rows.
+
+    Args:
+        points_c: ``(3, N)`` in the camera frame, metres.
+        px: ``(2, N)`` where they were measured, undistorted.
+        nearest_m: points nearer than this or behind the camera are projected from this depth.
+    """
+    z = np.maximum(points_c[2], nearest_m)
+    errors = np.empty((2, len(z)))
+    errors[0] = camera.fx * points_c[0] / z + (camera.cx - px[0])
+    errors[1] = camera.fy * points_c[1] / z + (camera.cy - px[1])
+    return errors
 
 
 def backproject(camera: Camera, points_px: Floats, depth_m: Floats) -> Floats:

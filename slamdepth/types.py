@@ -18,6 +18,8 @@ import numpy as np
 from slamdepth.errors import CameraError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
 _UNIT_TOLERANCE = 0.01
@@ -57,6 +59,22 @@ class Camera:
             raise CameraError("camera: depth_factor and fps must be positive")
         if len(self.distortion) != 5:
             raise CameraError("camera: distortion needs five numbers [k1, k2, p1, p2, k3]")
+
+    @classmethod
+    def from_file(cls, path: str | Path, notes: list[str] | None = None) -> Camera:
+        """Read a ``camera.yaml``, or a calibration as OpenCV or ROS write it.
+
+        Args:
+            notes: takes a line for whatever is unusual in the file, or that it was read from another
+                format; None: these lines are logged as warnings.
+
+        Raises:
+            CameraError: the file is missing or malformed, its lens model is not supported, or no camera
+                has such intrinsics; names the file, the key and the allowed ones.
+        """
+        from slamdepth.calibration import read_camera
+
+        return read_camera(path, cls, notes)
 
     @property
     def K(self) -> NDArray[np.float64]:

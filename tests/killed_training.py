@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trainings that are really killed, for ``tests/test_depth_training_kill.py``.
+"""Trainings that are killed by SIGKILL, for ``tests/test_depth_training_kill.py``.
 
-``python killed_training.py PLAN.json`` forks a child for every entry of the plan. A child
-trains; the first one to the end. Where an entry has a ``share``, its child sends itself
-SIGKILL before it executes the line of the training room that lies at this share of all the
-lines the first one executed: a moment like any other, but one that can be chosen again.
-What became of each child is printed as JSON.
+``python killed_training.py PLAN.json`` forks a child for each entry of the plan. A child trains; the
+first one to the end. If an entry has a ``share``, its child sends itself SIGKILL before it executes the
+line of the training package at that share of all lines executed by the first child, so the moment is
+reproducible. The outcome of each child is printed as JSON.
 """
 
 from __future__ import annotations
@@ -19,12 +18,13 @@ from types import FrameType
 from typing import Any
 
 import torch
+import torch._dynamo  # imported by the first optimiser step; otherwise each child spends seconds on it
 
 from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.training import loop
 from slamdepth.training.config import TrainConfig
 
-ROOM = str(Path(loop.__file__).parent)
+PACKAGE = str(Path(loop.__file__).parent)
 
 
 def tiny_backbone() -> DinoV2:
@@ -37,13 +37,13 @@ def tiny_backbone() -> DinoV2:
 
 
 class Lines:
-    """Counts executed lines of the training room and dies at one of them."""
+    """Counts the executed lines of the training package and kills the process at one of them."""
 
     def __init__(self, deadly: int | None) -> None:
         self.count, self.deadly, self.where = 0, deadly, ""
 
     def __call__(self, frame: FrameType, event: str, argument: Any) -> Any:
-        if not frame.f_code.co_filename.startswith(ROOM):
+        if not frame.f_code.co_filename.startswith(PACKAGE):
             return None
         if event == "line":
             self.count += 1
@@ -54,7 +54,7 @@ class Lines:
 
 
 def train(entry: dict[str, Any], all_lines: int) -> None:
-    """What a child does; its environment is its own."""
+    """The work of a child process."""
     os.environ["SLAMDEPTH_CACHE"] = entry["cache"]
     lines = Lines(round(entry["share"] * all_lines) if "share" in entry else None)
     if entry.get("torn_checkpoint"):
@@ -67,7 +67,7 @@ def train(entry: dict[str, Any], all_lines: int) -> None:
 
 
 def tear_checkpoint(number: int) -> None:
-    """The ``number``-th checkpoint is written by half when the process dies."""
+    """Kill the process when the ``number``-th checkpoint is half written."""
     real, calls = torch.save, []
 
     def save(state: Any, file: Any) -> None:
@@ -99,8 +99,8 @@ def main() -> None:
                 traceback.print_exc()
                 os._exit(1)
         os.close(writing)
-        with os.fdopen(reading) as told:
-            said = told.read()
+        with os.fdopen(reading) as pipe:
+            said = pipe.read()
         _, status = os.waitpid(child, 0)
         killed_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
         out.append({"killed_by": killed_by, "code": status >> 8 if not killed_by else None, "said": said})

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slamdepth.datasets import Dataset
 from slamdepth.errors import CameraError, ImageDecodeError
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.types import Camera, Frame, RunStatistics, StepResult, TrackingStatus, Trajectory
@@ -15,7 +16,7 @@ from slamdepth.types import Camera, Frame, RunStatistics, StepResult, TrackingSt
 CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
 
 
-class MadeUpDataset:
+class MadeUpDataset(Dataset):
     """Frames numbered by their grey value; some images or depth images do not decode."""
 
     name = "made-up"

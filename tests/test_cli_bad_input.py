@@ -187,7 +187,7 @@ def test_bad_calls(case: str, tiny_room: Path, tmp_path: Path) -> None:
         "OUT": tmp_path / "out",
         "GT": tiny_room / "groundtruth.txt",
         "BUSY": tmp_path,
-        "TRAINING": files("slamdepth") / "depth" / "configs" / "dinov2_head.yaml",
+        "TRAINING": files("slamdepth") / "training" / "configs" / "dinov2_head.yaml",
     }
     places["FILE"] = tmp_path / "file"
     places["FILE/out"] = tmp_path / "file" / "out"

@@ -36,7 +36,7 @@ class _Disparity:
 
 @pytest.fixture
 def disparity(monkeypatch: pytest.MonkeyPatch) -> str:
-    monkeypatch.setitem(registry._factories, "made-up", _Disparity)
+    monkeypatch.setitem(registry.MODELS.parts, "made-up", _Disparity)
     return "made-up"
 
 

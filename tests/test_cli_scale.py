@@ -21,7 +21,7 @@ from slamdepth.types import DepthKind, WeightsInfo
 @pytest.fixture(autouse=True)
 def flat(monkeypatch: pytest.MonkeyPatch) -> None:
     """A depth model called ``flat``, which takes a weights file, and a relative one."""
-    monkeypatch.setattr(registry, "_factories", dict(registry._factories))
+    monkeypatch.setattr(registry.MODELS, "parts", dict(registry.MODELS.parts))
 
     @registry.register("flat")
     def make(*, device: str = "cpu", seed: int = 0, weights: Path | None = None) -> ConstantDepth:

@@ -27,10 +27,10 @@ CAMERA = Camera(320, 240, 200.0, 200.0, 159.5, 119.5)
 def forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """What an example registers is gone after its test."""
     registry.known_readers()
-    monkeypatch.setattr(registry, "_readers", dict(registry._readers))
-    monkeypatch.setattr(depth_registry, "_factories", dict(depth_registry._factories))
+    monkeypatch.setattr(registry.READERS, "parts", dict(registry.READERS.parts))
+    monkeypatch.setattr(depth_registry.MODELS, "parts", dict(depth_registry.MODELS.parts))
     features.feature_names()
-    monkeypatch.setattr(features, "_EXTRACTORS", dict(features._EXTRACTORS))
+    monkeypatch.setattr(features.EXTRACTORS, "parts", dict(features.EXTRACTORS.parts))
     yield
     sys.modules.pop("example_of_contributing", None)
 

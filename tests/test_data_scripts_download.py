@@ -168,7 +168,7 @@ def test_downloads_checks_and_unpacks(fetch: Fetch) -> None:
     assert len(fetch.server.seen) == 1, "a folder already there costs no request"
 
 
-def test_goes_on_after_broken_connections(fetch: Fetch) -> None:
+def test_resumes_after_broken_connections(fetch: Fetch) -> None:
     fetch.server.cut = 3
     assert (fetch() / "rgb" / "0.png").read_bytes() == NOISE
     starts = [int(wanted[6:-1]) for _, wanted in fetch.server.seen if wanted]
@@ -177,7 +177,7 @@ def test_goes_on_after_broken_connections(fetch: Fetch) -> None:
     assert starts[0] == len(ARCHIVE) // 2
 
 
-def test_goes_on_in_another_run(fetch: Fetch, tum: ModuleType) -> None:
+def test_resumes_in_another_run(fetch: Fetch, tum: ModuleType) -> None:
     fetch.server.status = [503] * 5
     with pytest.raises(tum.DownloadError, match=r"answers 503 .*run again to go on"):
         fetch()
@@ -204,7 +204,7 @@ def stop_half_way(tum: ModuleType, fetch: Fetch) -> None:
     tum.fetch("fr1/desk", fetch.output, stop, base_url=fetch.server.url, wait_s=0.0)
 
 
-def test_starts_over_where_the_file_is_another_or_ranges_are_unknown(fetch: Fetch) -> None:
+def test_starts_over_if_the_file_changed_or_ranges_are_unsupported(fetch: Fetch) -> None:
     part = fetch.output / f"{NAME}.tgz.part"
     for etag, ranges in (('"older"', True), ('"one"', False)):
         fetch.server.ranges = ranges
@@ -221,7 +221,7 @@ def test_starts_over_where_the_file_is_another_or_ranges_are_unknown(fetch: Fetc
 
 
 @pytest.mark.parametrize("extra", [0, 7])
-def test_a_part_file_already_whole_or_too_long(fetch: Fetch, extra: int) -> None:
+def test_a_part_file_that_is_complete_or_too_long(fetch: Fetch, extra: int) -> None:
     fetch.output.mkdir()
     (fetch.output / f"{NAME}.tgz.part").write_bytes(ARCHIVE + b"x" * extra)
     assert (fetch() / "rgb" / "0.png").read_bytes() == NOISE

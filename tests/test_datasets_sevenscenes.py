@@ -168,7 +168,7 @@ def test_importing_the_package_imports_no_reader() -> None:
 @pytest.mark.parametrize(
     "name", ["frame-0001.png", "frame-000001.jpg", "frame-rate.txt", "frame-1.colour.png"]
 )
-def test_the_images_of_a_film_are_not_7_scenes(tmp_path: Path, name: str) -> None:
+def test_the_images_of_a_video_are_not_7_scenes(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"")
     assert not any(reader.matches(tmp_path) for reader in known_readers())
 

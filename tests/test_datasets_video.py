@@ -9,21 +9,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import call
-from tracking_scene import register_constant_depth
 
-from slamdepth.datasets import Dataset, open_dataset, read_camera, write_camera
+from slamdepth.datasets import Dataset, open_dataset, write_camera
 from slamdepth.datasets.readers.video import VideoSequence
 from slamdepth.datasets.video import VideoFile
 from slamdepth.errors import CameraError, DatasetError
-from slamdepth.geometry import rotation_angle_rad
-from slamdepth.io import read_tum_trajectory
 from slamdepth.types import Camera
 
 COUNT = 12
 
 
-def film(path: Path, images_bgr: list[np.ndarray], fps: float = 10.0) -> Path:
+def write_video(path: Path, images_bgr: list[np.ndarray], fps: float = 10.0) -> Path:
     size = (images_bgr[0].shape[1], images_bgr[0].shape[0])
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     for image in images_bgr:
@@ -32,8 +28,8 @@ def film(path: Path, images_bgr: list[np.ndarray], fps: float = 10.0) -> Path:
     return path
 
 
-def grey_film(path: Path, width: int = 64, height: int = 48) -> Path:
-    return film(path, [np.full((height, width, 3), 20 * n, np.uint8) for n in range(COUNT)])
+def grey_video(path: Path, width: int = 64, height: int = 48) -> Path:
+    return write_video(path, [np.full((height, width, 3), 20 * n, np.uint8) for n in range(COUNT)])
 
 
 def camera_file(path: Path, width: int = 64, height: int = 48) -> Path:
@@ -43,7 +39,7 @@ def camera_file(path: Path, width: int = 64, height: int = 48) -> Path:
 
 def opened(folder: Path, width: int = 64, height: int = 48) -> VideoSequence:
     dataset = open_dataset(
-        grey_film(folder / "walk.mp4", width, height), camera_file(folder / "phone.yaml", width, height)
+        grey_video(folder / "walk.mp4", width, height), camera_file(folder / "phone.yaml", width, height)
     )
     assert isinstance(dataset, VideoSequence)
     return dataset
@@ -88,7 +84,7 @@ def test_large_frames_are_reduced_with_their_camera(
 
 
 def test_a_video_needs_its_camera(tmp_path: Path) -> None:
-    video = grey_film(tmp_path / "walk.mp4")
+    video = grey_video(tmp_path / "walk.mp4")
     camera_file(tmp_path / "camera.yaml")  # of whatever else lies there
     with pytest.raises(CameraError, match=r"walk.mp4: the intrinsics of a video are unknown.*'width: 64'"):
         open_dataset(video)
@@ -110,7 +106,7 @@ def test_what_is_no_video(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("told_ms", "expected_s", "notes"),
+    ("times_ms", "expected_s", "notes"),
     [
         ([40.0, 73.0, 140.0], [0.0, 0.033, 0.1], 0),  # a phone's, at no equal intervals
         ([0.0, 0.0, 0.0], [0.0, 0.1, 0.2], 1),
@@ -118,7 +114,11 @@ def test_what_is_no_video(tmp_path: Path) -> None:
     ],
 )
 def test_each_frame_says_its_own_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told_ms: list[float], expected_s: list[float], notes: int
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    times_ms: list[float],
+    expected_s: list[float],
+    notes: int,
 ) -> None:
     class Capture:
         def __init__(self) -> None:
@@ -126,41 +126,16 @@ def test_each_frame_says_its_own_time(
 
         def grab(self) -> bool:
             self.at += 1
-            return self.at < len(told_ms)
+            return self.at < len(times_ms)
 
         def get(self, what: int) -> float:
             assert what == cv2.CAP_PROP_POS_MSEC
-            return told_ms[self.at]
+            return times_ms[self.at]
 
         def release(self) -> None:
             pass
 
-    video = VideoFile(grey_film(tmp_path / "walk.mp4"))
+    video = VideoFile(grey_video(tmp_path / "walk.mp4"))
     monkeypatch.setattr(video, "_open", Capture)
     np.testing.assert_allclose(video.timestamps_s(), expected_s)
     assert len(video.notes) == notes
-
-
-def test_a_video_is_run_like_its_frames(
-    tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The trajectory of a film of the rendered room is about the one of its images."""
-
-    register_constant_depth(monkeypatch)
-    images = [cv2.imread(str(path)) for path in sorted((tiny_room / "rgb").iterdir())]
-    camera = read_camera(tiny_room / "camera.yaml")
-    video = film(tmp_path / "room.avi", images, camera.fps)
-    write_camera(tmp_path / "phone.yaml", camera)
-    turns = []
-    phone = ["--camera", tmp_path / "phone.yaml"]
-    for name, sequence, more in (("film", video, phone), ("frames", tiny_room, [])):
-        done = call("run", sequence, "--depth", "constant", "--no-mesh", "-q", "-o", tmp_path / name, *more)
-        assert done.returncode == 0, done.stderr
-        trajectory, _ = read_tum_trajectory(tmp_path / name / "trajectory.txt")
-        assert len(trajectory) == len(images)
-        turns.append(trajectory.T_world_camera[:, :3, :3])
-    assert rotation_angle_rad(turns[1]).max() > 0.1
-    assert rotation_angle_rad(np.swapaxes(turns[0], 1, 2) @ turns[1]).max() < 0.02
-    refused = call("run", video, "--depth", "sensor", "--camera", tmp_path / "phone.yaml")
-    assert refused.returncode == 2
-    assert "has no sensor depth" in refused.stderr

@@ -23,13 +23,13 @@ from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX
 from slamdepth.depth.upright import roll_rad
 from slamdepth.errors import ConfigError, DatasetError, WeightsError
 from slamdepth.training import gravity, loop
-from slamdepth.training.augment import View, augmented_view, matching_view, plain_view
+from slamdepth.training.augment import View, augmented_view, matching_view, unaugmented_view
 from slamdepth.training.caches import fill_cache, plan_caches
 from slamdepth.training.config import AugmentConfig, HeadConfig, LossConfig, TrainConfig, ViewConfig
 from slamdepth.training.data import Place, open_place
 from slamdepth.training.features import load_batch, load_mixed_batch
-from slamdepth.training.losses import taught, total_loss
-from slamdepth.training.stages import not_always_told
+from slamdepth.training.losses import supervised, total_loss
+from slamdepth.training.stages import hide_gravity
 from slamdepth.training.views import Partner, SampleKey, make_view
 from slamdepth.types import Camera, Frame
 
@@ -138,10 +138,10 @@ def test_gravity_txt(tmp_path: Path) -> None:
     downs = [unit(0.1, 0.9, 0.3), unit(-1, 0, 0)]
     place = with_gravity(tmp_path / "room", *downs)
     for index, down in enumerate(downs):
-        np.testing.assert_allclose(place.down(index), down, atol=1e-7)
-    assert place.down(2) is None
+        np.testing.assert_allclose(place.gravity(index), down, atol=1e-7)
+    assert place.gravity(2) is None
     silent = open_place(make_place(tmp_path / "silent"))
-    assert silent.down(0) is None
+    assert silent.gravity(0) is None
     other = with_gravity(tmp_path / "other", downs[0], -downs[1])  # a file of the same size
     assert len({place.fingerprint, silent.fingerprint, other.fingerprint}) == 3
 
@@ -170,15 +170,15 @@ def test_down_is_what_the_place_says_or_else_what_lines_tell_and_is_remembered(
 
     monkeypatch.setattr(gravity, "gravity_if_upright", lines)
     monkeypatch.setattr(gravity, "_found", {})
-    monkeypatch.setattr(gravity, "_MOST_REMEMBERED", 2)
+    monkeypatch.setattr(gravity, "_MAX_CACHED", 2)
     place = with_gravity(tmp_path / "room", unit(0, 1, 0))
-    np.testing.assert_array_equal(gravity.down_of(place, 0), [0, 1, 0])
+    np.testing.assert_array_equal(gravity.gravity_of(place, 0), [0, 1, 0])
     assert not looked
     for _ in range(2):
-        assert gravity.down_of(place, 1) is None
-        np.testing.assert_array_equal(gravity.down_of(open_place(tmp_path / "room"), 2), [0, 0.8, 0.6])
+        assert gravity.gravity_of(place, 1) is None
+        np.testing.assert_array_equal(gravity.gravity_of(open_place(tmp_path / "room"), 2), [0, 0.8, 0.6])
     assert looked == [place.camera] * 2
-    gravity.down_of(place, 3)
+    gravity.gravity_of(place, 3)
     assert len(gravity._found) == 2  # the oldest was forgotten
 
 
@@ -201,7 +201,7 @@ def assert_the_plane_is_where_gravity_says(view: View, down: np.ndarray) -> None
     points = rays / view.focal_px * view.depth_m[v, u][:, None]
     found = np.linalg.lstsq(points, np.ones(len(points)), rcond=None)[0]
     assert 1 / np.linalg.norm(found) == pytest.approx(DISTANCE_M, rel=0.01)
-    assert found @ view.down / np.linalg.norm(found) == pytest.approx(NORMAL @ down, abs=0.02)
+    assert found @ view.gravity / np.linalg.norm(found) == pytest.approx(NORMAL @ down, abs=0.02)
 
 
 DOWNS = st.builds(
@@ -219,20 +219,20 @@ def test_views_are_turned_upright(down: np.ndarray, seed: int) -> None:
     frame = plane_frame()
     calm = CALM.model_copy(update={"max_tilt_deg": 0.0})
     for view in (
-        plain_view(frame, ROWS, COLUMNS, down),
+        unaugmented_view(frame, ROWS, COLUMNS, down),
         augmented_view(frame, ROWS, COLUMNS, calm, np.random.default_rng(seed), down),
     ):
-        assert np.linalg.norm(view.down) == pytest.approx(1.0)
-        assert view.down[0] == pytest.approx(0.0, abs=1e-9)
-        assert view.down[1] > 0
-        assert view.down[2] == pytest.approx(down[2])
+        assert np.linalg.norm(view.gravity) == pytest.approx(1.0)
+        assert view.gravity[0] == pytest.approx(0.0, abs=1e-9)
+        assert view.gravity[1] > 0
+        assert view.gravity[2] == pytest.approx(down[2])
         assert_the_plane_is_where_gravity_says(view, down)
     tilted = augmented_view(frame, ROWS, COLUMNS, CALM, np.random.default_rng(seed), down)
     assert_the_plane_is_where_gravity_says(tilted, down)
 
 
 def rolled_deg(view: View) -> float:
-    return float(np.degrees(roll_rad(view.down)))
+    return float(np.degrees(roll_rad(view.gravity)))
 
 
 def test_rolls_are_drawn_about_upright() -> None:
@@ -256,7 +256,7 @@ def test_a_partner_is_turned_until_gravity_points_as_wanted(
     pitch = np.arcsin(down[2]) + np.radians(10)  # no further apart than partners are
     wanted = np.append(wanted[:2] / np.linalg.norm(wanted[:2]) * np.cos(pitch), np.sin(pitch))
     view = matching_view(plane_frame(), ROWS, COLUMNS, CALM, np.random.default_rng(seed), down, wanted)
-    np.testing.assert_array_equal(view.down, wanted)
+    np.testing.assert_array_equal(view.gravity, wanted)
     assert_the_plane_is_where_gravity_says(view, down)
 
 
@@ -280,15 +280,15 @@ def test_what_is_mixed_into_a_view_shares_its_gravity(
 
     def watched(*args: object) -> View:
         view = matching_view(*args)  # type: ignore[arg-type]
-        taken.append((float(args[5][2]), float(view.down[2])))  # type: ignore[index]
+        taken.append((float(args[5][2]), float(view.gravity[2])))  # type: ignore[index]
         return view
 
     monkeypatch.setattr("slamdepth.training.views.matching_view", watched)
     mixed, again = (make_view(places, key, config, 3, partners) for _ in range(2))
     np.testing.assert_array_equal(mixed.image_rgb, again.image_rgb)
     alone = make_view(places, key, config, 3)
-    np.testing.assert_array_equal(mixed.down, alone.down)
-    assert mixed.down[1] > 0.9
+    np.testing.assert_array_equal(mixed.gravity, alone.gravity)
+    assert mixed.gravity[1] > 0.9
     assert (mixed.image_rgb != alone.image_rgb).any()
     assert len(taken) == 2
     assert all(abs(np.degrees(np.arcsin(of) - np.arcsin(to))) < 16 for of, to in taken)
@@ -299,8 +299,8 @@ def test_what_is_mixed_into_a_view_shares_its_gravity(
     unknown, plain = SampleKey(1, 0, 0), config.model_copy(update={"upright": False})
     as_ever = make_view(places, unknown, config, 3, partners)
     np.testing.assert_array_equal(as_ever.image_rgb, make_view(places, unknown, plain, 3, partners).image_rgb)
-    assert not as_ever.down.any()
-    assert not make_view(places, key, plain, 3, partners).down.any()
+    assert not as_ever.gravity.any()
+    assert not make_view(places, key, plain, 3, partners).gravity.any()
 
 
 @pytest.mark.parametrize(("relief", "level"), [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
@@ -311,7 +311,7 @@ def test_only_what_a_sample_teaches_is_learnt(relief: float, level: float) -> No
     target[:, :2] = 0.0
     prediction = head.coarse(*ARGS)[0]
     total_loss(
-        taught(prediction, target, torch.tensor([[relief, level]] * 2)), target, LossConfig()
+        supervised(prediction, target, torch.tensor([[relief, level]] * 2)), target, LossConfig()
     ).backward()
     assert head.scale_branch is not None
     assert head.out.weight.grad is not None
@@ -325,11 +325,11 @@ def test_a_sample_that_teaches_no_level_costs_nothing_for_its_scale() -> None:
     torch.manual_seed(5)
     prediction, target = torch.randn(2, 2, 6, 8), torch.rand(2, 6, 8) + 1.0
     both, relief = torch.ones(2, 2), torch.tensor([[1.0, 0.0], [1.0, 1.0]])
-    assert taught(prediction, target, both) is prediction
-    losses = [total_loss(taught(prediction, f * target, relief), f * target, LossConfig()) for f in
+    assert supervised(prediction, target, both) is prediction
+    losses = [total_loss(supervised(prediction, f * target, relief), f * target, LossConfig()) for f in
               (torch.ones(2, 1, 1), torch.tensor([3.0, 1.0])[:, None, None])]  # fmt: skip
     torch.testing.assert_close(*losses)
-    told = taught(prediction, target, relief)
+    told = supervised(prediction, target, relief)
     torch.testing.assert_close(told[1], prediction[1])
     error = told[0, 0] - target[0].log()
     assert float(error.mean()) == pytest.approx(0.0, abs=1e-6)
@@ -345,11 +345,16 @@ def training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **head: object) ->
         "coarse_epochs": 2,
         "batch": 3,
         "sources": [
-            {**source, "places": [{"name": "hall", "samples": 4}], "teaches": "level", "held_out": ["loft"]},
-            {**source, "places": [{"name": "hall", "samples": 5}], "teaches": "relief"},
+            {
+                **source,
+                "places": [{"name": "hall", "samples": 4}],
+                "supervision": "scale",
+                "held_out": ["loft"],
+            },
+            {**source, "places": [{"name": "hall", "samples": 5}], "supervision": "shape"},
         ],
         "view": {"rows": 42, "columns": 56, "upright": True},
-        "head": {"taps": [0, 1], "dim": 16, "guide_dim": 8, "level_dim": 4, "gravity": True, **head},
+        "head": {"taps": [0, 1], "dim": 16, "guide_dim": 8, "scale_dim": 4, "gravity": True, **head},
     })  # fmt: skip
 
 
@@ -357,11 +362,15 @@ def test_caches_know_gravity_and_what_they_teach(tmp_path: Path, monkeypatch: py
     config, backbone = training(tmp_path, monkeypatch), tiny_backbone()
     planned = plan_caches(config, "given")
     caches = [fill_cache(plan, config, backbone) for plan in planned]
-    assert [cache.teaches for cache in caches] == ["level", "relief", "both"]
-    np.testing.assert_allclose(caches[2].down[0], unit(0, 0.9, -0.1), atol=1e-6)  # the plain view of the loft
+    assert [cache.supervision for cache in caches] == ["scale", "shape", "both"]
+    np.testing.assert_allclose(
+        caches[2].gravity[0], unit(0, 0.9, -0.1), atol=1e-6
+    )  # the plain view of the loft
     field, depth = load_batch(caches[2], np.array([0]), "cpu")[3:]
     focal_px = torch.tensor([float(caches[2].focal_factor[0]) * CANONICAL_FOCAL_PX])
-    torch.testing.assert_close(field, gravity_field(torch.from_numpy(caches[2].down[:1]), focal_px, 42, 56))
+    torch.testing.assert_close(
+        field, gravity_field(torch.from_numpy(caches[2].gravity[:1]), focal_px, 42, 56)
+    )
     assert depth.shape == (1, 42, 56)
     batch, teaches = load_mixed_batch(caches, np.array([[2, 0], [1, 4], [0, 3], [1, 0]]), "cpu")
     assert teaches.tolist() == [[0, 1], [1, 0], [1, 0], [1, 1]]
@@ -375,13 +384,13 @@ def test_some_samples_are_not_told() -> None:
     torch.manual_seed(6)
     field = torch.ones(400, 4, 2, 2)
     batch = (torch.zeros(1), torch.zeros(1), torch.zeros(1), field, torch.zeros(1))
-    config = HeadConfig(level_dim=4, gravity=True, unknown_gravity=0.25)
-    told = not_always_told(batch, config)[3]
+    config = HeadConfig(scale_dim=4, gravity=True, unknown_gravity=0.25)
+    told = hide_gravity(batch, config)[3]
     assert bool((told.amin(dim=(1, 2, 3)) == told.amax(dim=(1, 2, 3))).all())
     assert float(told.mean()) == pytest.approx(0.75, abs=0.08)
     always, never = config.model_copy(update={"unknown_gravity": 0.0}), HeadConfig()
-    torch.testing.assert_close(not_always_told(batch, always)[3], field)
-    assert not_always_told(batch, never) is batch  # such a head does not read it
+    torch.testing.assert_close(hide_gravity(batch, always)[3], field)
+    assert hide_gravity(batch, never) is batch  # such a head does not read it
 
 
 def test_a_head_learns_with_gravity_the_same_for_the_same_seed(
@@ -398,5 +407,5 @@ def test_a_head_learns_with_gravity_the_same_for_the_same_seed(
 
 
 def test_settings_that_do_not_go_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigError, match="setting 'head': gravity needs a level_dim above 0"):
-        training(tmp_path, monkeypatch, level_dim=0)
+    with pytest.raises(ConfigError, match="setting 'head': gravity needs a scale_dim above 0"):
+        training(tmp_path, monkeypatch, scale_dim=0)

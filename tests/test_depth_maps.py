@@ -52,7 +52,7 @@ def models(monkeypatch: pytest.MonkeyPatch) -> None:
     for kind in DepthKind:
         name = f"ramp {kind.value}"
         factory: Any = lambda *, device, seed, n=name, k=kind: Ramp(n, k)  # noqa: E731
-        monkeypatch.setitem(registry._factories, name, factory)
+        monkeypatch.setitem(registry.MODELS.parts, name, factory)
 
 
 METRIC = f"ramp {DepthKind.METRIC.value}"

@@ -89,7 +89,7 @@ def test_a_mirror_image_of_a_mirror_image_is_the_image() -> None:
 def test_mirrored_models_are_created_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     from slamdepth.depth import registry
 
-    monkeypatch.setitem(registry._factories, "left", lambda **_: Left())
+    monkeypatch.setitem(registry.MODELS.parts, "left", lambda **_: Left())
     model = create_depth_model("mirrored:left")
     assert isinstance(model, MirroredDepth)
     assert (model.name, model.kind, model.weights) == ("mirrored:left", DepthKind.METRIC, Left.weights)

@@ -130,7 +130,7 @@ def test_a_plug_in_gets_available_devices_only(monkeypatch: pytest.MonkeyPatch) 
         return create_depth_model("sensor")
 
     point = SimpleNamespace(value="elsewhere:make", load=lambda: factory)
-    monkeypatch.setattr(registry, "_plugins", lambda: {"elsewhere": [point]})
+    monkeypatch.setattr(registry.MODELS, "_plugins", lambda: {"elsewhere": [point]})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     for device in ("cpu", "cuda", "cuda:1"):

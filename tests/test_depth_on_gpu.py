@@ -104,18 +104,18 @@ def test_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
             "batch": 4,
             "sources": [
                 {**hall, "held_out": ["shop"]},
-                {**loft, "teaches": "relief"},
-                {**hall, "augment": {"mixed": 1.0}, "teaches": "level"},
-                {**loft, "augment": {"rolled": 1.0, "max_roll_deg": 180.0}, "teaches": "down"},
+                {**loft, "supervision": "shape"},
+                {**hall, "augment": {"mixed": 1.0}, "supervision": "scale"},
+                {**loft, "augment": {"rolled": 1.0, "max_roll_deg": 180.0}, "supervision": "gravity"},
             ],
             "view": {"rows": 42, "columns": 56, "upright": True},
             "head": {
                 "taps": [0, 1],
                 "dim": 16,
                 "guide_dim": 8,
-                "level_dim": 4,
+                "scale_dim": 4,
                 "gravity": True,
-                "down_dim": 8,
+                "gravity_dim": 8,
             },
         }
     )

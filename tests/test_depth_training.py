@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training of a head on four made-up images with a tiny backbone; views, losses, readers."""
+"""Training of a head on four synthetic images with a tiny backbone; views, losses, readers."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from training_places import make_place
 
 from slamdepth.depth.head import load_head
 from slamdepth.errors import ConfigError, DatasetError
-from slamdepth.training import loop
-from slamdepth.training.augment import augmented_view, plain_view, turned_view
+from slamdepth.training import loop, member
+from slamdepth.training.augment import augmented_view, turned_view, unaugmented_view
 from slamdepth.training.config import AugmentConfig, TrainConfig
 from slamdepth.training.data import data_folder, open_place
 from slamdepth.training.losses import laplace_nll, multiscale_gradient, scale_invariant
@@ -75,13 +75,13 @@ def test_training_is_deterministic(settings: dict) -> None:
     assert other != first
 
 
-def test_a_killed_training_goes_on_to_the_same_result(
+def test_a_killed_training_resumes_to_the_same_result(
     settings: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = train(settings)
     expected = whole.output.read_bytes()
     whole.output.unlink()
-    real, calls = loop._epoch, []
+    real, calls = member.run_epoch, []
 
     def dies(*args: object, **kwargs: object) -> float:
         calls.append(1)
@@ -89,7 +89,7 @@ def test_a_killed_training_goes_on_to_the_same_result(
             raise KeyboardInterrupt
         return real(*args, **kwargs)
 
-    monkeypatch.setattr(loop, "_epoch", dies)
+    monkeypatch.setattr(member, "run_epoch", dies)
     with pytest.raises(KeyboardInterrupt):
         train(settings)
     again = train(settings)
@@ -123,7 +123,7 @@ def test_samples_of_another_shape_are_not_stored(tmp_path: Path) -> None:
     assert store.arrays["done"].tolist() == [1, 1, 0]
 
 
-def test_a_place_cannot_be_judge_and_party(settings: dict) -> None:
+def test_a_place_is_not_both_trained_on_and_held_out(settings: dict) -> None:
     both = {**settings["sources"][0], "held_out": ["room"]}
     with pytest.raises(ConfigError, match=r"room is held out and also trained on"):
         train({**settings, "sources": [both]})
@@ -145,9 +145,15 @@ def test_a_place_cannot_be_judge_and_party(settings: dict) -> None:
         ({"head": {"taps": []}}, "setting 'head.taps'"),
         ({"view": {"min_depth_m": 5, "max_depth_m": 1}}, "setting 'view': min_depth_m must be below"),
         ({"view": {"min_depth_m": 10}}, "setting 'view': min_depth_m must be below max_depth_m, got 10 and"),
-        ({"coarse_epochs": 0, "fine_epochs": 0}, "setting 'fine_epochs': there must be an epoch at least"),
+        ({"coarse_epochs": 0, "fine_epochs": 0}, "setting 'fine_epochs': at least one epoch is needed"),
         ({"learning_rate": float("inf")}, "setting 'learning_rate'"),
         ({"loss": {"nll": float("nan")}}, "setting 'loss.nll'"),
+        (
+            {"sources": [{"folder": "data", "teaches": "level"}]},
+            "setting 'sources.0.teaches': unknown setting",
+        ),
+        ({"sources": [{"folder": "data", "supervision": "level"}]}, "setting 'sources.0.supervision'"),
+        ({"head": {"down_dim": 8}}, "setting 'head.down_dim': unknown setting"),
     ],
 )
 def test_bad_settings_are_named(settings: dict, change: dict, says: str) -> None:
@@ -158,13 +164,13 @@ def test_bad_settings_are_named(settings: dict, change: dict, says: str) -> None
 
 def test_training_on_no_depth_is_an_error(settings: dict, caplog: pytest.LogCaptureFixture) -> None:
     settings["view"] |= {"min_depth_m": 8.0, "max_depth_m": 9.0}
-    with pytest.raises(DatasetError, match=r"room, third: no view .* has depth between 8 and 9 m; look at"):
+    with pytest.raises(DatasetError, match=r"room, third: no view .* has depth between 8 and 9 m; check"):
         train(settings)
     assert not Path(settings["output"]).exists()
     assert "other: no view of it has depth between 8 and 9 m" in caplog.text
 
 
-def test_every_member_needs_depth_and_a_place_without_is_told(
+def test_every_member_needs_depth_and_a_place_without_is_logged(
     settings: dict, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     for file in (tmp_path / "data" / "third").glob("*.png"):
@@ -174,7 +180,7 @@ def test_every_member_needs_depth_and_a_place_without_is_told(
     assert "room: no view" not in caplog.text
     first, second = settings["sources"]
     settings["sources"] = [{**first, "members": [0]}, {**second, "members": [1]}]
-    with pytest.raises(DatasetError, match="no view that a head is to learn from"):
+    with pytest.raises(DatasetError, match="no view that a head is to be trained on"):
         train(settings)
 
 
@@ -187,7 +193,7 @@ def test_settings_files(tmp_path: Path) -> None:
 
 
 def test_shipped_settings_are_valid() -> None:
-    folder = Path(loop.__file__).resolve().parent.parent / "configs"
+    folder = Path(loop.__file__).resolve().parent / "configs"
     files = sorted(folder.glob("*.yaml"))
     assert files
     for file in files:
@@ -266,7 +272,7 @@ def test_turned_depth_is_exact(turn: tuple[float, float, float], flip: bool) -> 
 
 def test_in_plane_roll_leaves_the_middle_s_depth() -> None:
     frame, _, _ = tilted_plane()
-    straight = plain_view(frame, 84, 112).depth_m[41:43, 55:57].mean()
+    straight = unaugmented_view(frame, 84, 112).depth_m[41:43, 55:57].mean()
     rolled = turned_view(frame, 84, 112, 90.0, 0, 0, 1.0, False)[1][41:43, 55:57].mean()
     assert rolled == pytest.approx(straight, rel=2e-3)
 

@@ -13,10 +13,11 @@ from training_places import make_place
 
 from slamdepth.depth.head import UPSAMPLING, load_head
 from slamdepth.errors import ConfigError
-from slamdepth.training import loop
+from slamdepth.training import loop, member
 from slamdepth.training.caches import Encoder, plan_caches
 from slamdepth.training.config import TrainConfig
 from slamdepth.training.features import FeatureCache
+from slamdepth.training.member import MemberTraining
 from slamdepth.training.plan import plan_training
 
 
@@ -44,22 +45,22 @@ def train(settings: dict[str, Any]) -> loop.TrainResult:
     return loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone())
 
 
-def test_a_member_learns_from_its_sources_alone(
+def test_a_member_is_trained_on_its_own_sources_only(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[tuple[int, int]] = []
-    real = loop._epoch
+    real = member.run_epoch
 
-    def spy(config: TrainConfig, caches: list[FeatureCache], *rest: Any) -> float:
+    def spy(training: MemberTraining, caches: list[FeatureCache], *rest: Any) -> float:
         seen.append((rest[4], sum(map(len, rest[0]))))  # rest: views, head, optimiser, epoch, member
-        return real(config, caches, *rest)
+        return real(training, caches, *rest)
 
-    monkeypatch.setattr(loop, "_epoch", spy)
+    monkeypatch.setattr(member, "run_epoch", spy)
     train(settings)
     assert seen == [(0, 8), (0, 8), (1, 8), (1, 8)]  # its own place and the common one
 
 
-def test_a_checkpoint_of_another_layout_of_heads_is_not_gone_on_with(
+def test_a_checkpoint_of_another_head_format_is_not_resumed(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def kill(*_: Any) -> None:
@@ -70,8 +71,8 @@ def test_a_checkpoint_of_another_layout_of_heads_is_not_gone_on_with(
         with pytest.raises(KeyboardInterrupt):
             train(settings)
     epochs: list[int] = []
-    real = loop._epoch
-    monkeypatch.setattr(loop, "_epoch", lambda *a: (epochs.append(a[5]), real(*a))[1])
+    real = member.run_epoch
+    monkeypatch.setattr(member, "run_epoch", lambda *a: (epochs.append(a[5]), real(*a))[1])
     monkeypatch.setattr(loop, "FORMAT", "another")
     train(settings)
     assert epochs == [0, 1, 0, 1]  # of both members, from the start
@@ -82,13 +83,13 @@ def test_a_member_without_a_place_is_an_error(settings: dict[str, Any]) -> None:
         train({**settings, "sources": settings["sources"][:1]})
 
 
-def test_a_member_that_there_is_not_is_an_error(settings: dict[str, Any]) -> None:
+def test_a_member_that_does_not_exist_is_an_error(settings: dict[str, Any]) -> None:
     sources = [{**settings["sources"][0], "members": [7]}, *settings["sources"][1:]]
-    with pytest.raises(ConfigError, match="teach member 7, and there are members 0 to 1"):
+    with pytest.raises(ConfigError, match="names member 7, and there are members 0 to 1"):
         TrainConfig.from_dict({**settings, "sources": sources})
 
 
-def test_what_no_member_learns_from_is_not_computed(settings: dict[str, Any]) -> None:
+def test_features_that_train_no_member_are_not_computed(settings: dict[str, Any]) -> None:
     config = TrainConfig.from_dict(settings).model_copy(update={"members": 1})  # as a search does
     planned = plan_caches(config, Encoder(tiny_backbone()).key)
     assert [plan.places[0].name for plan in planned] == ["hall", "yard"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dissertation's training: its loss by hand, and that it learns what can be learnt."""
+"""The dissertation's training: the loss against a direct computation, and convergence."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_the_loss_is_mse_times_exp_of_one_less_ssim() -> None:
     assert float(mse_ssim_loss(torch.from_numpy(target), torch.from_numpy(target))) == 0.0
 
 
-def test_unknown_pixels_teach_nothing() -> None:
+def test_unknown_pixels_have_no_gradient() -> None:
     target = torch.zeros(2, 32, 32)
     target[0, :16] = 2.0  # the second image is unknown altogether
     predicted = torch.full((2, 32, 32), 3.0, requires_grad=True)
@@ -64,7 +64,7 @@ def test_depth_shrinks_over_known_pixels() -> None:
     assert shrink(depth, 224) is depth
 
 
-def test_it_learns_depth_that_one_feature_tells_and_repeats_itself() -> None:
+def test_training_converges_and_is_reproducible() -> None:
     rng = np.random.default_rng(0)
     features = rng.uniform(0, 1, (64, 8)).astype(np.float16)
     depth = np.zeros((64, 224, 224), np.float32)
@@ -79,7 +79,7 @@ def test_it_learns_depth_that_one_feature_tells_and_repeats_itself() -> None:
     assert train_mlp(features, depth, replace(settings, epochs=5))[1] == losses[:5]
 
 
-def test_depth_is_brought_to_one_focal_length() -> None:
+def test_depth_is_normalised_to_one_focal_length() -> None:
     pairs = MlpPairs(
         np.zeros((2, 224, 224, 3), np.uint8), np.ones((2, 224, 224), np.float32), np.array([100.0, 200.0])
     )
@@ -91,10 +91,10 @@ def test_tokens_are_computed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     place = open_place(make_place(tmp_path / "room"))
     torch.manual_seed(0)
     backbone = DinoV2(dim=6, depth=1, heads=3, grid=5).eval()
-    told: list[TrainStep] = []
-    tokens = cached_tokens(place, backbone, "sha", progress=told.append)
+    steps: list[TrainStep] = []
+    tokens = cached_tokens(place, backbone, "sha", progress=steps.append)
     assert tokens.shape == (len(place), 257 * 6)
-    assert told[-1] == TrainStep("tokens of room", len(place), len(place))
+    assert steps[-1] == TrainStep("tokens of room", len(place), len(place))
     again = cached_tokens(place, backbone, "sha", progress=lambda step: pytest.fail("computed again"))
     np.testing.assert_array_equal(again, tokens)
     assert len(list((store.cache_dir() / "features").iterdir())) == 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertainty learnt from errors in places that the predicting head had not seen."""
+"""Uncertainty fitted to errors in places that the predicting head was not trained on."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from training_places import make_place
 from slamdepth.depth.head import load_head
 from slamdepth.depth.uncertainty import FEATURES, UncertaintyNet, features, mean_log_spread
 from slamdepth.errors import ConfigError
-from slamdepth.training import loop, out_of_fold, timing
+from slamdepth.training import loop, member, out_of_fold, timing
 from slamdepth.training.caches import Encoder, plan_caches
 from slamdepth.training.config import AugmentConfig, TrainConfig
 from slamdepth.training.out_of_fold import (
     Errors,
-    fit_doubt,
+    fit_uncertainty,
+    network_inputs,
     plan_folds,
-    read_by,
     sigma_scale,
     spread_of,
     surest_half,
@@ -53,7 +53,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     }
 
 
-def made_up_errors(seed: int = 0, places: int = 3) -> Errors:
+def synthetic_errors(seed: int = 0, places: int = 3) -> Errors:
     """Errors six times as large where the first channel of the tokens is 1 as where it is -1."""
     torch.manual_seed(seed)
     count = 6000
@@ -67,33 +67,33 @@ def made_up_errors(seed: int = 0, places: int = 3) -> Errors:
     return Errors(tokens.half(), torch.randn(count, FEATURES), error, error / means, own, view % places, view)
 
 
-def test_it_learns_where_errors_are_large_and_how_large() -> None:
-    doubt = fit_doubt(made_up_errors(), seed=0)
-    other = made_up_errors(seed=1)
-    judged = doubt.log_spread(read_by(doubt, other))
+def test_the_fit_predicts_where_errors_are_large_and_how_large() -> None:
+    network = fit_uncertainty(synthetic_errors(), seed=0)
+    other = synthetic_errors(seed=1)
+    judged = network.log_spread(network_inputs(network, other))
     assert surest_half(judged, other) < 0.4  # of 1 and 6 in equal parts: 1 / 3.5 = 0.29
     assert surest_half(other.own, other) == pytest.approx(1, abs=0.1)
-    torch.testing.assert_close(spread_of(doubt, other), (other.own + judged) / 2)
+    torch.testing.assert_close(spread_of(network, other), (other.own + judged) / 2)
     spread, is_large = judged.exp(), other.tokens[:, 0] > 0
     assert spread[is_large].median() / spread[~is_large].median() == pytest.approx(6, rel=0.25)
     assert spread[~is_large].median() == pytest.approx(0.1, rel=0.2)
     # 68 % of a Laplace distribution lie within 1.15 of its spread, 0.81 of its deviation
-    assert sigma_scale(doubt, replace(other, own=judged)) == pytest.approx(0.81, rel=0.1)
+    assert sigma_scale(network, replace(other, own=judged)) == pytest.approx(0.81, rel=0.1)
 
 
-def test_the_map_is_read_as_its_pixels_are() -> None:
+def test_a_map_is_evaluated_like_its_pixels() -> None:
     torch.manual_seed(0)
-    doubt = fit_doubt(made_up_errors(), seed=0)
+    network = fit_uncertainty(synthetic_errors(), seed=0)
     tokens, log_depth = torch.randn(2, 8, 3, 4), torch.randn(2, 6, 8)
     own, sine = torch.randn(2, 2, 6, 8).unbind()
-    whole = doubt(tokens, log_depth, own, sine)
+    whole = network(tokens, log_depth, own, sine)
     assert whole.shape == (2, 6, 8)
-    seen = doubt.basis @ (tokens[1, :, 2, 1] - doubt.centre)
-    one = torch.cat([seen, doubt.standardised(features(log_depth, own, sine))[1, 5, 2]])
-    torch.testing.assert_close(whole[1, 5, 2], mean_log_spread(own[1, 5, 2], doubt.log_spread(one)))
+    seen = network.basis @ (tokens[1, :, 2, 1] - network.centre)
+    one = torch.cat([seen, network.standardised(features(log_depth, own, sine))[1, 5, 2]])
+    torch.testing.assert_close(whole[1, 5, 2], mean_log_spread(own[1, 5, 2], network.log_spread(one)))
 
 
-def test_what_is_read_is_free_of_the_scale_of_a_frame() -> None:
+def test_features_do_not_depend_on_the_scale_of_a_frame() -> None:
     log_depth, own, sine = torch.randn(3, 1, 6, 9).unbind()
     read = features(log_depth, own, sine)
     torch.testing.assert_close(features(log_depth + 0.7, own + 0.3, sine), read, atol=1e-4, rtol=1e-4)
@@ -106,21 +106,21 @@ def test_what_is_read_is_free_of_the_scale_of_a_frame() -> None:
     torch.testing.assert_close(read[0, :, 2:-2, 11], ramp[0, :, 2:-2])  # a ramp is smooth
 
 
-def test_folds_share_no_place_and_try_nothing_mixed(settings: dict[str, Any]) -> None:
+def test_folds_share_no_place_and_leave_out_no_mixed_view(settings: dict[str, Any]) -> None:
     planned = plan_caches(TrainConfig.from_dict(settings), Encoder(tiny_backbone()).key)
     everything, nothing = [0, 1, 2, 3], []
-    told = [
-        ([views.tolist() for views in fold.learnt], [views.tolist() for views in fold.left_out])
+    found = [
+        ([views.tolist() for views in fold.training], [views.tolist() for views in fold.left_out])
         for fold in plan_folds(planned)
     ]
-    # hall, loft, and hall again with others mixed in, which is learnt from where hall is not left out
-    assert told == [
+    # hall, loft, and hall again with mixed views, which are trained on if hall is not left out
+    assert found == [
         ([nothing, everything, nothing], [everything, nothing, nothing]),
         ([everything, nothing, everything], [nothing, everything, nothing]),
     ]
-    of_down = replace(planned[1], teaches="down")
+    of_gravity = replace(planned[1], supervision="gravity")
     mixed = replace(planned[1], view=planned[1].view.model_copy(update={"augment": AugmentConfig(mixed=0.1)}))
-    for other in (of_down, mixed):
+    for other in (of_gravity, mixed):
         with pytest.raises(ConfigError, match="two places whose views are not mixed"):
             plan_folds([planned[0], other])
 
@@ -136,17 +136,17 @@ def test_places_are_left_out_a_third_at_a_time(settings: dict[str, Any], tmp_pat
         {"hall", "cellar"}, {"loft"}, {"attic"}
     ]  # fmt: skip
     for fold in folds:
-        assert sorted([*fold.learnt[0], *fold.left_out[0]]) == list(range(8))
+        assert sorted([*fold.training[0], *fold.left_out[0]]) == list(range(8))
 
 
-def test_too_few_places_are_told_before_any_work(settings: dict[str, Any], tmp_path: Path) -> None:
+def test_too_few_places_are_an_error_before_any_work(settings: dict[str, Any], tmp_path: Path) -> None:
     config = TrainConfig.from_dict({**settings, "sources": settings["sources"][:1]})
     with pytest.raises(ConfigError, match="'uncertainty'"):
         loop.train_depth(config, backbone=tiny_backbone())
     assert not (tmp_path / "cache").exists()
 
 
-def test_a_head_with_a_doubt_is_made_judged_and_planned(settings: dict[str, Any]) -> None:
+def test_a_head_with_fitted_uncertainty_is_trained_evaluated_and_planned(settings: dict[str, Any]) -> None:
     config = TrainConfig.from_dict(settings)
     plan = plan_training(config, backbone=tiny_backbone())
     assert plan.steps == 3 * 3 + 2 * (1 + 2)  # 12 views; one fold has the 4 of loft, one the 8 of hall
@@ -155,7 +155,7 @@ def test_a_head_with_a_doubt_is_made_judged_and_planned(settings: dict[str, Any]
     assert isinstance(head.uncertainty, UncertaintyNet)
     assert head.sigma_scale == result.sigma_scale > 0
     assert set(result.unseen_surest_half) == {"hall", "loft"}
-    assert set(result.unseen_surest_half["loft"]) == {"out_of_fold", "own", "relief"}
+    assert set(result.unseen_surest_half["loft"]) == {"out_of_fold", "own", "depth_contrast"}
     own = loop.train_depth(config.model_copy(update={"uncertainty": "own"}), backbone=tiny_backbone())
     without, _ = load_head(own.output)
     depth, sigma = (a - b for a, b in zip(outputs(head), outputs(without), strict=True))
@@ -168,18 +168,18 @@ def test_a_plan_counts_the_time_of_every_fit(
 ) -> None:
     planned = plan_caches(TrainConfig.from_dict(settings), "test")
     steps: list[int | None] = []
-    real = out_of_fold.fit_doubt
+    real = out_of_fold.fit_uncertainty
 
     def fit(errors: Errors, seed: int, **more: Any) -> UncertaintyNet:
         steps.append(more.get("steps"))
         return real(errors, seed, **more)
 
-    monkeypatch.setattr(timing, "fit_doubt", fit)
+    monkeypatch.setattr(timing, "fit_uncertainty", fit)
     seconds = iter((0.5, 2.0))
     monkeypatch.setattr(timing, "second_time", lambda work: (work(), next(seconds))[1])
-    views = 4 + 4  # of hall and of loft, each left out once; what is mixed is not tried on
-    before_s = 0.5 * views * out_of_fold.PIXELS / timing._MADE_UP_PIXELS
-    assert timing.doubt_s(planned, plan_folds(planned), 24) == pytest.approx(3 * (before_s + 1.5))
+    views = 4 + 4  # of hall and of loft, each left out once; mixed views are not left out
+    setup_s = 0.5 * views * out_of_fold.PIXELS / timing._SYNTHETIC_PIXELS
+    assert timing.uncertainty_s(planned, plan_folds(planned), 24) == pytest.approx(3 * (setup_s + 1.5))
     assert steps == [0, None]
 
 
@@ -192,7 +192,7 @@ def outputs(head: Any) -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize(
     "stage", ["member 1 of 1", "without places, 2", "uncertainty", "uncertainty without"]
 )
-def test_interrupted_it_goes_on_to_the_same_bytes(
+def test_an_interrupted_fit_resumes_to_the_same_bytes(
     settings: dict[str, Any], stage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = TrainConfig.from_dict(settings)
@@ -205,8 +205,8 @@ def test_interrupted_it_goes_on_to_the_same_bytes(
     with pytest.raises(KeyboardInterrupt):
         loop.train_depth(config, progress=interrupt, backbone=tiny_backbone())
     epochs: list[int] = []
-    real = loop._epoch
-    monkeypatch.setattr(loop, "_epoch", lambda *a: (epochs.append(a[6]), real(*a))[1])
+    real = member.run_epoch
+    monkeypatch.setattr(member, "run_epoch", lambda *a: (epochs.append(a[6]), real(*a))[1])
     again = loop.train_depth(config, backbone=tiny_backbone())
     assert again.output.read_bytes() == whole
     assert epochs == {"member 1 of 1": [0, 0, 0, 1, 1, 2, 2], "without places, 2": [2, 2]}.get(stage, [])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a trained head goes is checked before anything is computed."""
+"""The output of a training is checked before anything is computed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from training_places import tiny_settings
 
 from slamdepth.errors import OutputError
 from slamdepth.pipeline.training import plan_run, run_search, run_training
-from slamdepth.training import output as training_output
 from slamdepth.training.checkpoint import checkpoint_path
 from slamdepth.training.config import TrainConfig
 from slamdepth.training.output import check_output
@@ -47,7 +46,7 @@ def make_others(folder: Path) -> None:
         ("n" * 300 + ".safetensors", "cannot be written"),
     ],
 )
-def test_a_wrong_place_is_told_before_any_work(
+def test_a_bad_output_is_an_error_before_any_work(
     settings: dict[str, Any], name: str, says: str, tmp_path: Path
 ) -> None:
     make_others(tmp_path)
@@ -61,11 +60,11 @@ def test_a_wrong_place_is_told_before_any_work(
     assert (tmp_path / "precious.safetensors").read_text() == "precious"
 
 
-def test_a_folder_without_permission_is_told(
+def test_a_folder_without_permission_is_an_error(
     settings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Path] = []
-    monkeypatch.setattr(training_output.os, "access", lambda path, mode: asked.append(path))
+    monkeypatch.setattr("os.access", lambda path, mode: asked.append(path))
     config = TrainConfig.from_dict({**settings, "output": str(tmp_path / "new" / "head.safetensors")})
     with pytest.raises(OutputError, match="no permission to write to"):
         check_output(config)
@@ -87,7 +86,7 @@ def test_a_home_folder_is_expanded(
         check_output(config.model_copy(update={"output": "~nobody-of-this-name/head.safetensors"}))
 
 
-def test_the_command_says_it_in_one_line(settings: dict[str, Any], tmp_path: Path) -> None:
+def test_the_command_prints_one_line(settings: dict[str, Any], tmp_path: Path) -> None:
     make_others(tmp_path)
     file = tmp_path / "train.yaml"
     for more in ([], ["--dry-run"], ["--search", "1"]):

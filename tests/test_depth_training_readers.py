@@ -26,7 +26,7 @@ from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.pipeline.training_data import sequence_readers
 from slamdepth.synth.sequence import SynthSettings, render_sequence
 from slamdepth.training import data
-from slamdepth.training.augment import plain_view, turned_view
+from slamdepth.training.augment import turned_view, unaugmented_view
 from slamdepth.training.caches import benchmarks_seen, plan_caches
 from slamdepth.training.config import TrainConfig
 from slamdepth.training.data import data_folder, known_readers, open_place, register_reader
@@ -36,7 +36,7 @@ from slamdepth.training.readers.pairs import PairReader
 from slamdepth.types import Camera
 
 FR1 = (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)
-BENT = Camera(160, 120, 129.3, 129.1, 79.7, 63.8, FR1)
+DISTORTED = Camera(160, 120, 129.3, 129.1, 79.7, 63.8, FR1)
 
 
 def open_any(folder: Path, reader: str | None = None) -> data.Place:
@@ -103,7 +103,7 @@ def test_pairs_through_a_lens(tmp_path: Path) -> None:
     assert place.fingerprint != without.fingerprint
     _, depth = plane_frame(place.camera)
     cv2.imwrite(str(folder / "00000.png"), np.round(depth * 1000).astype(np.uint16))
-    view = plain_view(place.read(0), 28, 42)
+    view = unaugmented_view(place.read(0), 28, 42)
     assert_shows_the_plane(view.depth_m, view.focal_px, rtol=0.02)
 
 
@@ -121,22 +121,22 @@ def test_a_folder_of_pairs_that_cannot_be_read_is_named(
 
 
 def test_tum_pairs_by_time_and_undoes_the_lens(tmp_path: Path) -> None:
-    place = open_any(make_tum(tmp_path / "own_room", BENT))
+    place = open_any(make_tum(tmp_path / "own_room", DISTORTED))
     assert len(place) == 2  # the first image has no depth near it
     assert place.benchmark == "sequences in the TUM RGB-D layout"
     frame = place.read(1)
     assert frame.index == 1
     assert frame.camera.is_distorted
-    view = plain_view(frame, 84, 112)
+    view = unaugmented_view(frame, 84, 112)
     assert_shows_the_plane(view.depth_m, view.focal_px)
     # the lens matters: taken for a pinhole's, the same image is wrong by more than the tolerance
     pinhole = type(frame)(0, 0.0, frame.image_rgb, frame.camera.without_distortion(), frame.depth_m)
     with pytest.raises(AssertionError):
-        assert_shows_the_plane(plain_view(pinhole, 84, 112).depth_m, view.focal_px)
+        assert_shows_the_plane(unaugmented_view(pinhole, 84, 112).depth_m, view.focal_px)
 
 
 def test_image_and_depth_stay_together_through_the_lens(tmp_path: Path) -> None:
-    frame = open_any(make_tum(tmp_path / "room", BENT)).read(0)
+    frame = open_any(make_tum(tmp_path / "room", DISTORTED)).read(0)
     image, depth, _ = turned_view(frame, 84, 112, 30.0, 4.0, -3.0, 1.2, True)
     known = depth > 0
     assert known.mean() > 0.6
@@ -150,28 +150,28 @@ def test_image_and_depth_stay_together_through_the_lens(tmp_path: Path) -> None:
 def test_7scenes(tmp_path: Path) -> None:
     place = open_any(make_sevenscenes(tmp_path / "kitchen"))
     assert (len(place), place.benchmark) == (2, "7-Scenes sequences")
-    assert place.down(0) is None
+    assert place.gravity(0) is None
     depth_m = place.read(0).depth_m
     assert depth_m is not None
     assert (depth_m[:10] == 0).all()
-    view = plain_view(place.read(0), 112, 154)
+    view = unaugmented_view(place.read(0), 112, 154)
     assert_shows_the_plane(view.depth_m, view.focal_px)
 
 
-def test_synth_is_told_from_tum(tmp_path: Path) -> None:
+def test_synth_is_distinguished_from_tum(tmp_path: Path) -> None:
     room = render_sequence(tmp_path / "room", SynthSettings(frames=2, width=64, height=48))
     place = open_any(room)
     assert (len(place), place.benchmark) == (2, None)
     assert place.read(0).depth_m is not None
     assert open_any(room, "tum").benchmark is not None
     with pytest.raises(DatasetError, match=r"no synth\.yaml here"):
-        open_any(make_tum(tmp_path / "tum", BENT), "synth")
+        open_any(make_tum(tmp_path / "tum", DISTORTED), "synth")
 
 
 def test_hypersim(tmp_path: Path) -> None:
     place = open_any(make_hypersim(tmp_path / "ai_001_001"))
     assert (place.name, len(place), place.benchmark) == ("ai_001_001", 3, None)
-    assert place.down(0) is None
+    assert place.gravity(0) is None
     assert place.camera.fx == pytest.approx(886.81 / 8)
     assert "1 of 4 frames have no image" in place.notes
     frame = place.read(2)  # of the second camera
@@ -269,14 +269,14 @@ def test_layouts_are_found_or_named(tmp_path: Path) -> None:
 
 
 def test_a_sequence_without_depth_is_refused(tmp_path: Path) -> None:
-    folder = make_tum(tmp_path / "room", BENT)
+    folder = make_tum(tmp_path / "room", DISTORTED)
     (folder / "depth.txt").unlink()
     with pytest.raises(DatasetError, match="has no sensor depth"):
         open_any(folder)
 
 
 def test_a_damaged_image_of_a_sequence_is_named(tmp_path: Path) -> None:
-    folder = make_tum(tmp_path / "room", BENT)
+    folder = make_tum(tmp_path / "room", DISTORTED)
     place = open_any(folder)
     (folder / "depth" / "1.png").write_bytes(b"x")
     with pytest.raises(DatasetError, match=r"1\.png: the image does not decode"):
@@ -294,7 +294,7 @@ def test_an_image_of_another_size_is_named(tmp_path: Path) -> None:
 
 def test_a_reader_is_one_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known_readers()
-    monkeypatch.setattr(data, "_readers", dict(data._readers))
+    monkeypatch.setattr(data.READERS, "parts", dict(data.READERS.parts))
     pairs = open_place(make_place(tmp_path / "room"))
 
     @register_reader
@@ -330,8 +330,8 @@ def source_config(folder: Path, **source: object) -> TrainConfig:
     )
 
 
-def test_benchmarks_trained_on_are_told(tmp_path: Path) -> None:
-    make_tum(tmp_path / "rgbd_dataset_freiburg1_desk", BENT)
+def test_benchmarks_trained_on_are_reported(tmp_path: Path) -> None:
+    make_tum(tmp_path / "rgbd_dataset_freiburg1_desk", DISTORTED)
     make_place(tmp_path / "room")
     trained, held_out = [{"name": "rgbd_dataset_freiburg1_desk"}], ["rgbd_dataset_freiburg1_desk"]
     config = source_config(tmp_path, places=trained, held_out=["room"])
@@ -355,7 +355,7 @@ def test_a_cache_is_named_by_what_its_files_are(tmp_path: Path) -> None:
     assert other != folders[0]
 
 
-def test_one_and_the_same_place_is_never_both(tmp_path: Path) -> None:
+def test_the_same_place_is_never_both_trained_on_and_held_out(tmp_path: Path) -> None:
     make_place(tmp_path / "room")
     with pytest.raises(ConfigError, match="room is held out and also trained on"):
         plan_caches(source_config(tmp_path, places=[{"name": "room"}], held_out=["room"]), "given")

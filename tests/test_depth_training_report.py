@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training leaves beside the head, what --dry-run tells, and what can go wrong on a disk."""
+"""The report of a training, the output of --dry-run, and failures of the disk."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return tiny_settings(tmp_path, monkeypatch)
 
 
-def test_a_training_explains_itself(settings: dict[str, Any]) -> None:
+def test_a_training_writes_a_report(settings: dict[str, Any]) -> None:
     steps: list[TrainStep] = []
     result = run_training(TrainConfig.from_dict(settings), progress=steps.append, backbone=tiny_backbone())
     folder = report_folder(result.output)
@@ -37,9 +37,9 @@ def test_a_training_explains_itself(settings: dict[str, Any]) -> None:
         "losses.png", "samples.png", "history.json", "README.txt"
     }  # fmt: skip
     for name in ("losses.png", "samples.png"):
-        picture = cv2.imread(str(folder / name))
-        assert picture is not None
-        assert picture.std() > 10
+        image = cv2.imread(str(folder / name))
+        assert image is not None
+        assert image.std() > 10
     history = json.loads((folder / "history.json").read_text())
     assert [(e["member"], e["epoch"], e["is_fine"]) for e in history["epochs"]] == [
         (m, e, e == 2) for m in (0, 1) for e in range(3)
@@ -53,13 +53,13 @@ def test_a_training_explains_itself(settings: dict[str, Any]) -> None:
         ("room", 8, False), ("other", 2, True)
     ]  # fmt: skip
     assert "head.safetensors" in (folder / "README.txt").read_text()
-    # Each stage is told from nothing to all, one name a stage.
+    # Each stage has a unique name and is reported from start to end.
     stages = list(dict.fromkeys(step.stage for step in steps))
     assert stages[2:] == ["member 1 of 2", "member 2 of 2"]
     for stage in stages:
-        told = [step for step in steps if step.stage == stage]
-        assert [step.done for step in told] == sorted(step.done for step in told)
-        assert told[-1].done == told[-1].total
+        reported = [step for step in steps if step.stage == stage]
+        assert [step.done for step in reported] == sorted(step.done for step in reported)
+        assert reported[-1].done == reported[-1].total
     assert steps[-1].detail.startswith("epoch 3 of 3, loss ")
 
 
@@ -73,7 +73,7 @@ def test_samples_are_held_out_ones_first_and_metric(settings: dict[str, Any]) ->
     assert (sample.predicted_m > 0).all()
 
 
-def test_without_held_out_places_there_are_pictures_too(settings: dict[str, Any]) -> None:
+def test_a_training_without_held_out_places_has_plots_too(settings: dict[str, Any]) -> None:
     source = {**settings["sources"][0], "held_out": []}
     config = TrainConfig.from_dict({**settings, "sources": [source], "members": 1, "fine_epochs": 0})
     result = run_training(config, backbone=tiny_backbone())
@@ -110,7 +110,9 @@ def test_a_damaged_checkpoint_starts_its_member_again(
     assert again.output.read_bytes() == data
 
 
-def test_a_full_disk_is_told_before(settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_an_error_before_any_work(
+    settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     from slamdepth.training import store
 
     monkeypatch.setattr(store.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1000}))
@@ -118,7 +120,7 @@ def test_a_full_disk_is_told_before(settings: dict[str, Any], monkeypatch: pytes
         loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone())
 
 
-def test_a_cut_cache_is_made_anew(settings: dict[str, Any], tmp_path: Path) -> None:
+def test_a_truncated_cache_is_computed_again(settings: dict[str, Any], tmp_path: Path) -> None:
     data = loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone()).output.read_bytes()
     for file in (tmp_path / "cache" / "features").glob("*/tokens.npy"):
         file.write_bytes(file.read_bytes()[:500])
@@ -145,7 +147,7 @@ def test_a_plan_counts_and_measures_and_writes_nothing(settings: dict[str, Any],
         assert source.size_bytes == pytest.approx(on_disk, abs=6 * 256)  # headers and marks
 
 
-def test_dry_run_without_a_backbone_says_what_is_missing(settings: dict[str, Any], tmp_path: Path) -> None:
+def test_a_dry_run_without_a_backbone_names_what_is_missing(settings: dict[str, Any], tmp_path: Path) -> None:
     file = tmp_path / "train.yaml"
     file.write_text(yaml.safe_dump(settings))
     done = call("train-depth", file, "--dry-run")
@@ -167,7 +169,7 @@ def test_bad_input_is_one_line(settings: dict[str, Any], tmp_path: Path) -> None
     assert "unknown reader 'tun' of training data; choose from:" in done.stderr
 
 
-def test_pictures_are_the_same_for_the_same_training(settings: dict[str, Any]) -> None:
+def test_plots_are_the_same_for_the_same_training(settings: dict[str, Any]) -> None:
     from slamdepth.report.training import draw_samples
 
     result = loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone())

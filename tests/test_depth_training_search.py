@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hyper-parameters by trial: reproducible, resumable, judged by held-out places alone."""
+"""Hyper-parameter search: reproducible, resumable, scored on held-out places only."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def with_optuna() -> None:
     pytest.importorskip("optuna", reason="Optuna is not installed: pip install 'slamdepth[search]'")
 
 
-def test_a_search_goes_on_to_the_same_trials(searched: dict[str, Any], tmp_path: Path) -> None:
+def test_a_resumed_search_makes_the_same_trials(searched: dict[str, Any], tmp_path: Path) -> None:
     with_optuna()
     whole = run_search(TrainConfig.from_dict(searched), 4, backbone=tiny_backbone())
     assert len(whole.trials) == 4
@@ -79,14 +79,14 @@ def test_the_best_settings_are_a_ready_config(searched: dict[str, Any]) -> None:
     assert "no longer a test" in found.best_config.read_text()
 
 
-def test_a_study_that_is_none_is_one_error(searched: dict[str, Any]) -> None:
+def test_a_file_that_is_no_study_is_one_error(searched: dict[str, Any]) -> None:
     with_optuna()
     Path(searched["output"]).with_name("head_search.sqlite3").write_bytes(b"not a database" * 100)
     with pytest.raises(OutputError, match=r"head_search\.sqlite3: cannot be used as a study"):
         run_search(TrainConfig.from_dict(searched), 1, backbone=tiny_backbone())
 
 
-def test_a_diverged_trial_counts_and_loses() -> None:
+def test_a_diverged_trial_gets_the_worst_score() -> None:
     assert search._score({"a": {search.FIGURE: float("nan")}}) == search._score({"a": {}}) == 1e3
     assert search._score({"a": {search.FIGURE: 0.2}, "b": {search.FIGURE: 0.4}}) == pytest.approx(0.3)
 
@@ -118,7 +118,7 @@ def test_bad_ranges_are_named(searched: dict[str, Any], ranges: dict[str, Any], 
         run_search(TrainConfig.from_dict({**searched, "search": ranges}), 1, backbone=tiny_backbone())
 
 
-def test_a_search_needs_a_judge(searched: dict[str, Any]) -> None:
+def test_a_search_needs_a_held_out_place(searched: dict[str, Any]) -> None:
     source = {**searched["sources"][0], "held_out": []}
-    with pytest.raises(ConfigError, match="needs a place under 'held_out' to judge by"):
+    with pytest.raises(ConfigError, match="needs a place under 'held_out' to score by"):
         run_search(TrainConfig.from_dict({**searched, "sources": [source]}), 1, backbone=tiny_backbone())

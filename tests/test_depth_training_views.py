@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Views of training pairs: scenes put into one another, exactly; and the same for the same seed."""
+"""Mixed training views: exact composition of two scenes, and reproducibility."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def test_the_nearer_surface_hides_the_farther_one() -> None:
     assert mixed.focal_px == 100.0
 
 
-def test_depth_is_brought_to_the_focal_length_of_the_first() -> None:
-    # 2 m through a lens of 200 px look like 1 m through one of 100 px, and so are before 1.5 m.
+def test_depth_is_normalised_to_the_focal_length_of_the_first() -> None:
+    # 2 m at 200 px look like 1 m at 100 px, which is nearer than 1.5 m.
     mixed = mixed_view(wall(RED, np.full((6, 9), 1.5), 100.0), wall(BLUE, np.full((6, 9), 2.0), 200.0))
     assert (mixed.image_rgb == BLUE).all()
     np.testing.assert_allclose(mixed.depth_m, 1.0)
 
 
-def test_a_hole_of_the_sensor_is_as_near_as_what_surrounds_it_and_stays_unknown() -> None:
+def test_unknown_depth_takes_its_nearest_known_depth_and_stays_unknown() -> None:
     holed = np.full((6, 9), 1.0)
     holed[2:4, 3:6] = 0.0
     mixed = mixed_view(wall(RED, holed, 100.0), wall(BLUE, np.full((6, 9), 2.0), 100.0))
@@ -52,7 +52,9 @@ def test_a_hole_of_the_sensor_is_as_near_as_what_surrounds_it_and_stays_unknown(
 
 
 @given(DEPTHS, DEPTHS)
-def test_every_pixel_is_one_of_the_two_with_its_own_depth(first_m: np.ndarray, second_m: np.ndarray) -> None:
+def test_every_pixel_has_colour_and_depth_of_one_of_the_two(
+    first_m: np.ndarray, second_m: np.ndarray
+) -> None:
     mixed = mixed_view(wall(RED, first_m, 100.0), wall(BLUE, second_m, 100.0))
     is_first = (mixed.image_rgb == RED).all(axis=2)
     assert (is_first | (mixed.image_rgb == BLUE).all(axis=2)).all()

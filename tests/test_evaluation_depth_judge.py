@@ -137,7 +137,7 @@ def test_sigma_by_hand() -> None:
     assert judgement.surest_half.value == pytest.approx(low / ((low + high) / 2), rel=1e-4)
 
 
-def test_many_frames_wait_on_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_frames_spill_to_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("slamdepth.evaluation.depth_judge._IN_MEMORY_BYTES", 1000)
     judgement = judged([r * 0.8 for r in ROOMS], ROOMS)
     is_perfect(judgement, "sequence_median")

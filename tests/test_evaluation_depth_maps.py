@@ -159,8 +159,8 @@ def test_an_affine_prediction_is_undone(factor: float, shift: float, kind: Depth
 def test_a_flat_prediction_fits_as_the_mean_and_nothing_leaves_the_range() -> None:
     sensor = np.array([1.0, 3.0])
     assert affine_fit(np.array([2.0, 2.0]), sensor, DepthKind.METRIC) == (0.0, 2.0)
-    held = apply_affine(np.array([1.0, 5.0, 0.0]), (10.0, -20.0), DepthKind.METRIC, 0.1, 10.0)
-    np.testing.assert_array_equal(held, [0.1, 10.0, 0.0])
+    clipped = apply_affine(np.array([1.0, 5.0, 0.0]), (10.0, -20.0), DepthKind.METRIC, 0.1, 10.0)
+    np.testing.assert_array_equal(clipped, [0.1, 10.0, 0.0])
     inverse = apply_affine(np.array([1.0]), (1.0, -2.0), DepthKind.AFFINE_INVERSE_DEPTH, 0.1, 10.0)
     assert inverse[0] == pytest.approx(10.0)
 

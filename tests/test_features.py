@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every feature promises: how many, where, how sure, and the same each time."""
+"""What every extractor promises: count, spread, uncertainty and determinism."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from slamdepth.frontend.features import (
     feature_names,
     feature_weights,
     register_extractor,
-    spread,
 )
+from slamdepth.frontend.keypoints import spread
 from slamdepth.frontend.metric import Hamming, UnitL2
 from slamdepth.types import Camera
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 
 
-def picture(seed: int = 0, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
+def image(seed: int = 0, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
     """Strong texture in one corner and weak texture elsewhere, as rooms have."""
     rng = np.random.default_rng(seed)
     noise = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), 1.5)
@@ -64,7 +64,7 @@ def occupancy(px: np.ndarray, cell: int = 20) -> float:
 
 
 def test_count_shapes_and_types(extractor: FeatureExtractor) -> None:
-    features = extractor.extract(picture(), CAMERA)
+    features = extractor.extract(image(), CAMERA)
     n = len(features)
     assert 150 <= n <= 300
     assert features.raw_px.shape == features.px.shape == (n, 2)
@@ -79,7 +79,7 @@ def test_count_shapes_and_types(extractor: FeatureExtractor) -> None:
 
 
 def test_descriptors_are_what_the_metric_compares(extractor: FeatureExtractor) -> None:
-    features = extractor.extract(picture(), CAMERA)
+    features = extractor.extract(image(), CAMERA)
     metric, descriptors = features.metric, features.descriptors
     assert metric.empty().dtype == descriptors.dtype
     assert metric.empty().shape[1:] == descriptors.shape[1:]
@@ -90,8 +90,8 @@ def test_descriptors_are_what_the_metric_compares(extractor: FeatureExtractor) -
         np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1.0, atol=1e-4)
 
 
-def test_larger_keypoints_are_less_sure(extractor: FeatureExtractor) -> None:
-    features = extractor.extract(picture(), CAMERA)
+def test_larger_keypoints_are_less_certain(extractor: FeatureExtractor) -> None:
+    features = extractor.extract(image(), CAMERA)
     np.testing.assert_allclose(features.sigma_px, extractor.levels.sigma_px(features.octave))
     sigma = extractor.levels.sigma_px(np.arange(extractor.levels.count))
     assert (np.diff(sigma) > 0).all()
@@ -99,21 +99,21 @@ def test_larger_keypoints_are_less_sure(extractor: FeatureExtractor) -> None:
 
 
 def test_weak_texture_gets_its_share(extractor: FeatureExtractor) -> None:
-    px = extractor.extract(picture(), CAMERA).raw_px
+    px = extractor.extract(image(), CAMERA).raw_px
     is_strong = (px < [120, 100]).all(axis=1)
     assert 0.05 < np.mean(is_strong) < 0.5
 
 
 def test_orb_spreads_wider_than_opencv_does(orb: FeatureExtractor) -> None:
-    ours = occupancy(orb.extract(picture(), CAMERA).raw_px)
-    own = cv2.ORB_create(nfeatures=300, fastThreshold=7).detect(picture(), None)
+    ours = occupancy(orb.extract(image(), CAMERA).raw_px)
+    own = cv2.ORB_create(nfeatures=300, fastThreshold=7).detect(image(), None)
     assert ours > 1.3 * occupancy(np.array([k.pt for k in own]))
 
 
 def test_deterministic(extractor: FeatureExtractor) -> None:
-    first = extractor.extract(picture(), CAMERA)
-    extractor.extract(picture(1), CAMERA)  # nothing stays behind of an earlier image
-    second = extractor.extract(picture(), CAMERA)
+    first = extractor.extract(image(), CAMERA)
+    extractor.extract(image(1), CAMERA)  # nothing stays behind of an earlier image
+    second = extractor.extract(image(), CAMERA)
     np.testing.assert_array_equal(first.raw_px, second.raw_px)
     np.testing.assert_array_equal(first.descriptors, second.descriptors)
 
@@ -136,15 +136,15 @@ def test_an_image_too_small_for_a_patch_has_none(orb: FeatureExtractor) -> None:
 
 def test_pixels_are_undistorted(extractor: FeatureExtractor) -> None:
     camera = Camera(320, 240, 260, 260, 159.5, 119.5, (0.1, 0.02, 0.001, -0.001, 0.0))
-    features = extractor.extract(picture(), camera)
+    features = extractor.extract(image(), camera)
     np.testing.assert_allclose(features.px, camera.undistort_points(features.raw_px))
     assert np.abs(features.px - features.raw_px).max() > 1.0
-    np.testing.assert_array_equal(features.raw_px, extractor.extract(picture(), CAMERA).raw_px)
+    np.testing.assert_array_equal(features.raw_px, extractor.extract(image(), CAMERA).raw_px)
 
 
-def test_a_moved_picture_is_matched_with_itself(extractor: FeatureExtractor) -> None:
+def test_a_moved_image_is_matched_with_itself(extractor: FeatureExtractor) -> None:
     """By 8 rows and 16 columns: what is at one pixel of the one is there in the other."""
-    wide = picture(shape=(248, 336))
+    wide = image(shape=(248, 336))
     a, b = extractor.extract(wide[:240, :320], CAMERA), extractor.extract(wide[8:, 16:], CAMERA)
     i, j = a.match(b, np.arange(len(a)), ratio=0.85)
     assert len(i) > 40
@@ -154,8 +154,8 @@ def test_a_moved_picture_is_matched_with_itself(extractor: FeatureExtractor) -> 
 
 
 def test_places_are_recognised_by_orb(extractor: FeatureExtractor, orb: FeatureExtractor) -> None:
-    expected = orb.extract(picture(), CAMERA).descriptors
-    features = extractor.extract(picture(), CAMERA)
+    expected = orb.extract(image(), CAMERA).descriptors
+    features = extractor.extract(image(), CAMERA)
     np.testing.assert_array_equal(features.place_descriptors, expected)
     np.testing.assert_array_equal(features.place_descriptors, expected)  # also when the image is gone
 
@@ -169,7 +169,7 @@ def test_a_level_is_the_nearest_size() -> None:
 
 
 def test_matching_keeps_to_the_keypoints_asked_for(orb: FeatureExtractor) -> None:
-    features = orb.extract(picture(), CAMERA)
+    features = orb.extract(image(), CAMERA)
     among = np.arange(3, len(features), 7)
     i, j = features.match(features, among, ratio=0.85)
     np.testing.assert_array_equal(among[i], j)

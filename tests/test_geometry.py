@@ -17,6 +17,7 @@ from slamdepth.geometry import (
     orthonormalised,
     project,
     quat_xyzw_to_rotation,
+    reprojection_errors,
     rotation_angle_rad,
     rotation_to_quat_xyzw,
     se3_exp,
@@ -113,6 +114,15 @@ def test_backproject_undoes_project(seed: int) -> None:
     np.testing.assert_allclose(z, depth)
 
 
+def test_reprojection_errors_are_projections_less_measurements() -> None:
+    rng = np.random.default_rng(0)
+    points_c, px = rng.uniform((-1, -1, 0.5), (1, 1, 4), (20, 3)), rng.uniform(0, 480, (20, 2))
+    errors = reprojection_errors(CAMERA, points_c.T, px.T, 0.1)
+    np.testing.assert_allclose(errors.T, project(CAMERA, points_c)[0] - px, atol=1e-9)
+    behind = reprojection_errors(CAMERA, np.array([[0.1], [0.0], [-2.0]]), np.zeros((2, 1)), 0.1)
+    np.testing.assert_allclose(behind[:, 0], [CAMERA.cx + CAMERA.fx, CAMERA.cy])
+
+
 def test_the_optical_axis_meets_the_principal_point() -> None:
     px, z = project(CAMERA, np.array([[0.0, 0.0, 2.0], [0.2, 0.0, 2.0], [0.0, 0.0, -1.0]]))
     np.testing.assert_allclose(px[0], [CAMERA.cx, CAMERA.cy])
@@ -125,9 +135,9 @@ def test_the_optical_axis_meets_the_principal_point() -> None:
 def test_orthonormalised_is_near_and_exact(seed: int) -> None:
     rng = np.random.default_rng(seed)
     T = se3_exp(rng.normal(size=6))
-    bent = T.copy()
-    bent[:3, :3] += 1e-4 * rng.normal(size=(3, 3))
-    fixed = orthonormalised(bent)
+    inexact = T.copy()
+    inexact[:3, :3] += 1e-4 * rng.normal(size=(3, 3))
+    fixed = orthonormalised(inexact)
     np.testing.assert_allclose(fixed[:3, :3] @ fixed[:3, :3].T, np.eye(3), atol=1e-14)
     assert np.linalg.det(fixed[:3, :3]) > 0
     np.testing.assert_allclose(fixed, T, atol=1e-3)

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from slamdepth.errors import OutputError
-from slamdepth.pipeline.folder import FILES, RunFolder, run_log, writable_file, write_log_to
+from slamdepth.io import writable_file
+from slamdepth.pipeline.folder import FILES, RunFolder, run_log, write_log_to
 from slamdepth.pipeline.options import RunOptions
 from slamdepth.pipeline.run import _arguments
 

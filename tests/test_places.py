@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from data_scripts.train_vocabulary import k_majority, main, train_vocabulary
-from slamdepth.errors import DatasetError, OutputError, TrackingError, WeightsError
+from slamdepth.errors import TrackingError, WeightsError
+from slamdepth.frontend.metric import hamming_nearest
 from slamdepth.geometry import quat_xyzw_to_rotation, rotation_angle_rad
 from slamdepth.loops.places import PlaceRecogniser
-from slamdepth.loops.vocabulary import Vocabulary, load_vocabulary, nearest
+from slamdepth.loops.vocabulary import Vocabulary, load_vocabulary
 
 
 def random_descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -40,13 +40,16 @@ def test_nearest_is_the_nearest_in_hamming_distance(count: int, centres: int, se
     a, b = random_descriptors(rng, count), random_descriptors(rng, centres)
     b[-1] = b[0]  # a tie goes to the first
     bits = np.unpackbits(a, axis=1)[:, None] != np.unpackbits(b, axis=1)[None]
-    np.testing.assert_array_equal(nearest(a, b), bits.sum(axis=2).argmin(axis=1))
+    np.testing.assert_array_equal(hamming_nearest(a, b), bits.sum(axis=2).argmin(axis=1))
 
 
 def test_all_256_bits_different_is_far_and_not_near() -> None:
     zeros, ones = np.zeros((1, 32), dtype=np.uint8), np.full((1, 32), 255, dtype=np.uint8)
     assert (
-        nearest(zeros, np.concatenate([ones, with_flipped_bits(zeros, 200, np.random.default_rng(0))])) == 1
+        hamming_nearest(
+            zeros, np.concatenate([ones, with_flipped_bits(zeros, 200, np.random.default_rng(0))])
+        )
+        == 1
     )
 
 
@@ -56,31 +59,6 @@ def test_all_256_bits_different_is_far_and_not_near() -> None:
 def test_other_descriptors_are_refused(tiny: Vocabulary, wrong: np.ndarray) -> None:
     with pytest.raises(ValueError, match=r"\(N, 32\) uint8"):
         tiny.quantise(wrong)
-
-
-def test_k_majority_finds_the_centres_of_well_separated_clusters() -> None:
-    rng = np.random.default_rng(1)
-    centres = random_descriptors(rng, 6)
-    members = np.repeat(np.arange(6), 41)
-    found, cluster = k_majority(with_flipped_bits(centres[members], 20, rng), 6, rng)
-    assert {bytes(c) for c in found} == {bytes(c) for c in centres}
-    assert len({(a, b) for a, b in zip(members, cluster, strict=True)}) == 6
-
-
-def test_k_majority_needs_enough_distinct_descriptors() -> None:
-    with pytest.raises(ValueError, match="3 clusters need as many distinct descriptors, got 2"):
-        k_majority(
-            np.repeat(random_descriptors(np.random.default_rng(0), 2), 5, axis=0), 3, np.random.default_rng(0)
-        )
-
-
-def test_training_is_deterministic_and_weighs_by_images() -> None:
-    rng = np.random.default_rng(2)
-    images = [random_descriptors(rng, 60) for _ in range(8)]
-    first, second = (train_vocabulary(images, 4, 5, seed=3) for _ in range(2))
-    np.testing.assert_array_equal(first.words, second.words)
-    seen = [sum(w in first.quantise(image) for image in images) for w in range(20)]
-    np.testing.assert_allclose(first.idf, np.log(8 / np.maximum(seen, 1)), atol=1e-6)
 
 
 def test_a_vocabulary_survives_the_disk_byte_for_byte(tmp_path: Path, tiny: Vocabulary) -> None:
@@ -168,26 +146,6 @@ def test_misuse_is_refused(tiny: Vocabulary) -> None:
         recogniser.add(4, tiny.words)
     with pytest.raises(TrackingError, match="keyframe 5 was never added"):
         recogniser.query_keyframe(5)
-
-
-def test_the_training_command_writes_a_vocabulary(tmp_path: Path) -> None:
-    import cv2
-
-    rng = np.random.default_rng(0)
-    for place in ("hall", "kitchen_kinect"):
-        (tmp_path / place).mkdir()
-        for k in range(2):
-            blobs = cv2.resize(rng.integers(0, 256, (30, 40), dtype=np.uint8), (320, 240))
-            cv2.imwrite(str(tmp_path / place / f"{k}.jpg"), blobs)
-    command = ["--data", str(tmp_path), "--branches", "3", "--leaves", "4"]
-    assert main([*command, "--output", str(tmp_path / "v.npz")]) == 0
-    vocabulary = load_vocabulary(tmp_path / "v.npz")
-    assert len(vocabulary) == 12
-    assert "of 2 images" in vocabulary.description  # the left-out place does not count
-    with pytest.raises(OutputError, match=r"must be a \.npz file"):
-        main([*command, "--output", str(tmp_path / "v.txt")])
-    with pytest.raises(DatasetError, match="no such folder"):
-        main(["--data", str(tmp_path / "absent"), "--output", str(tmp_path / "v.npz")])
 
 
 @pytest.mark.data

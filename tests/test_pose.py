@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of one camera, from points known exactly and from points of doubtful depth."""
+"""The pose of one camera, from points known exactly and from points of uncertain depth."""
 
 from __future__ import annotations
 
@@ -95,12 +95,12 @@ def test_information_predicts_the_scatter() -> None:
 
 
 def along_ray(X: np.ndarray, sigma_log: float, across_m: float = 1e-3) -> np.ndarray:
-    """Covariance of points that the camera at the origin saw with a doubtful depth."""
+    """Covariance of points that the camera at the origin saw with an uncertain depth."""
     along = X * sigma_log
     return along[:, :, None] * along[:, None, :] + across_m**2 * np.eye(3)
 
 
-def test_doubtful_depth_wrong_by_a_third_leaves_the_rotation_alone() -> None:
+def test_uncertain_depth_wrong_by_a_third_leaves_the_rotation_alone() -> None:
     """What is sure, the epipolar geometry, decides; the wrong, common scale only scales the step."""
     X, T = scene(200)
     px, _ = project(CAMERA, transform(T, X))
@@ -118,7 +118,7 @@ def test_doubtful_depth_wrong_by_a_third_leaves_the_rotation_alone() -> None:
 
 
 def test_independent_depth_errors_average_out() -> None:
-    """Each point's depth off on its own by 30 %: believed, they bend the pose; weighted, hardly."""
+    """Each point's depth off on its own by 30 %: taken as exact, they falsify the pose; weighted, hardly."""
     X, T = scene(300)
     px, _ = project(CAMERA, transform(T, X))
     px += 0.5 * np.random.default_rng(1).normal(size=px.shape)

@@ -190,7 +190,7 @@ def test_unsound_clouds_are_refused() -> None:
 
 
 def path(frames: int) -> np.ndarray:
-    """A curve of about 0.7 m, from rest to rest: slow motion is what plain KISS-ICP drags behind."""
+    """A curve of about 0.7 m, from rest to rest: KISS-ICP alone lags behind slow motion."""
     a = np.linspace(0.0, 1.0, frames)
     a = a * a * (3 - 2 * a)
     T = np.stack([0.5 * np.sin(2 * a), -0.1 * a, 0.4 * a, 0.1 * np.sin(3 * a), 0.5 * a, 0.05 * a], axis=1)

@@ -119,14 +119,16 @@ def test_the_rate_is_the_derivative() -> None:
     ("change_s", "sigma_s", "readout_s"),
     [
         (0.02, 0.001, 0.02),
-        (0.002, 0.001, 0.0),  # within its doubt: global
-        (0.02, 0.01, 0.0),  # too unsure to say anything
-        (0.2, 0.001, 0.0),  # absurd
+        (0.002, 0.001, 0.0),  # within its uncertainty: global
+        (0.02, 0.01, 0.0),  # too uncertain
+        (0.2, 0.001, 0.0),  # impossible
         (0.04, 0.001, 1 / 30),  # longer than a frame
         (-0.02, 0.001, -0.02),  # a camera hung upside down
     ],
 )
-def test_what_is_believed_of_a_readout_time(change_s: float, sigma_s: float, readout_s: float) -> None:
+def test_a_readout_time_is_kept_where_it_is_certain_and_possible(
+    change_s: float, sigma_s: float, readout_s: float
+) -> None:
     shutter = Shutter(PINHOLE, ShutterConfig(), LandmarkMap())
     assert shutter.learn(change_s, sigma_s) is (readout_s != 0)
     assert shutter.readout_s == pytest.approx(readout_s)
@@ -146,7 +148,7 @@ def tracked(frames: list[Frame], config: Config = CONFIG) -> Reconstruction:
 
 
 def upright(frame: Frame) -> Frame:
-    """The same taken by the camera held upright, turned a quarter to the left."""
+    """The rolling frames taken by an upright camera, turned a quarter to the left."""
     camera = replace(
         CAMERA,
         width=CAMERA.height,
@@ -189,8 +191,15 @@ def rolling_frames() -> list[Frame]:
     return frames(change=lambda frame: shaken(frame, READOUT_S))
 
 
-def test_the_readout_time_is_found_and_the_trajectory_better_for_it(rolling_frames: list[Frame]) -> None:
-    found = tracked(rolling_frames)
+@pytest.fixture(scope="module")
+def found(rolling_frames: list[Frame]) -> Reconstruction:
+    """The reconstruction with a readout time estimated by the tracker."""
+    return tracked(rolling_frames)
+
+
+def test_the_readout_time_is_found_and_the_trajectory_better_for_it(
+    rolling_frames: list[Frame], found: Reconstruction
+) -> None:
     assert found.statistics.readout_sigma_s is not None
     # seven keyframes of 320 x 240: noisy velocities make it too short
     assert 0.6 * READOUT_S < (found.statistics.readout_s or 0.0) < 1.1 * READOUT_S
@@ -201,15 +210,17 @@ def test_the_readout_time_is_found_and_the_trajectory_better_for_it(rolling_fram
     assert ate_m(found.trajectory) < 0.5 * ate_m(ignored.trajectory)
 
 
-def test_a_phone_held_upright_rolls_along_the_width(rolling_frames: list[Frame]) -> None:
+def test_a_phone_held_upright_rolls_along_the_width(
+    rolling_frames: list[Frame], found: Reconstruction
+) -> None:
     turned = [upright(frame) for frame in rolling_frames]
     tracker = create_tracker(turned[0].camera, SensorDepth(), CONFIG)
     for frame in turned:
         tracker.step(frame)
-    found = tracker.finish()
-    assert 0.6 * READOUT_S < (found.statistics.readout_s or 0.0) < 1.1 * READOUT_S
+    upright_found = tracker.finish()
+    assert 0.6 * READOUT_S < (upright_found.statistics.readout_s or 0.0) < 1.1 * READOUT_S
     # the camera turned, its path did not
-    assert ate_m(found.trajectory) < 2.0 * ate_m(tracked(rolling_frames).trajectory)
+    assert ate_m(upright_found.trajectory) < 2.0 * ate_m(found.trajectory)
 
 
 def test_a_global_shutter_is_recognised() -> None:
@@ -230,7 +241,7 @@ def test_a_cut_in_the_recording_is_no_motion(rolling_frames: list[Frame], cut: i
     np.testing.assert_allclose(made[cut:], made[:16], atol=0.03)
 
 
-def test_a_frame_found_anew_is_as_fast_as_the_frames_after_it() -> None:
+def test_a_reregistered_frame_is_as_fast_as_the_frames_after_it() -> None:
     """It was placed without a velocity, so its own place is not to be trusted for one."""
     landmarks = LandmarkMap()
     log = FrameLog(PINHOLE, landmarks)

@@ -42,7 +42,7 @@ def test_sift_with_a_constant_prior_tracks_every_frame_up_to_scale() -> None:
     assert ate_m(run.finish().trajectory, with_scale=True) < 0.02
 
 
-def test_a_lost_camera_finds_its_place_by_orb_words() -> None:
+def test_a_lost_camera_finds_its_place_by_orb_descriptors() -> None:
     """Both lenses are covered, and then the camera is back at the fourth frame."""
 
     def hidden(frame: Frame) -> Frame:

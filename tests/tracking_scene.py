@@ -39,13 +39,17 @@ CONFIG = Config.from_dict({"features": {"count": 600}})
 Change = Callable[[Frame], Frame]
 
 
-@lru_cache(maxsize=2)
 def walk(*, bare: bool = False) -> tuple[tuple[Frame, ...], NDArray[np.float64]]:
     """All frames with exact depth, and their poses ``(COUNT, 4, 4)`` in the first camera.
 
     Args:
         bare: along the same path through a white room.
     """
+    return _rendered(bare)
+
+
+@lru_cache  # of a function without defaults: walk() and walk(bare=False) would be two entries
+def _rendered(bare: bool) -> tuple[tuple[Frame, ...], NDArray[np.float64]]:
     settings = SETTINGS.model_copy(update={"texture": "bare"}) if bare else SETTINGS
     frames, poses = zip(*render_frames(settings, range(COUNT)), strict=True)
     return frames, invert(poses[0]) @ np.stack(poses)
@@ -103,7 +107,7 @@ def register_constant_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     def flat(**_: Any) -> ConstantDepth:
         return ConstantDepth()
 
-    monkeypatch.setitem(registry._factories, "constant", flat)
+    monkeypatch.setitem(registry.MODELS.parts, "constant", flat)
 
 
 class Run:

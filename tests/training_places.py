@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Made-up training data in every layout, tiny."""
+"""Tiny synthetic training data in every layout."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from slamdepth.types import Camera
 
 
 def make_place(folder: Path, count: int = 4, width: int = 64, height: int = 48) -> Path:
-    """Pairs whose brightness tells the depth."""
+    """Pairs whose brightness encodes the depth."""
     folder.mkdir(parents=True)
     about = {"width": width, "height": height, "fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5}
     (folder / "camera.json").write_text(json.dumps({**about, "depth_unit_m": 0.001}))

@@ -26,10 +26,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamdepth.backend.bundle_solver import MIN_DEPTH_M, Solver, State
+from slamdepth.geometry import CHI2_2DOF_95, reprojection_errors
 from slamdepth.types import Camera
 from slamdepth.typing import Bools, Floats, Ints
-
-CHI2_2DOF_95 = 5.991
 
 
 @dataclass(frozen=True)
@@ -135,13 +134,10 @@ def bundle_adjust(
 
 def _pixel_chi2(problem: BundleProblem, state: State) -> Floats:
     T = state.T[problem.obs_camera]
-    P = np.einsum("nij,nj->ni", T[:, :3, :3], state.X[problem.obs_point]) + T[:, :3, 3]
-    z = np.maximum(P[:, 2], MIN_DEPTH_M)
-    camera = problem.camera
-    du = camera.fx * P[:, 0] / z + camera.cx - problem.px[:, 0]
-    dv = camera.fy * P[:, 1] / z + camera.cy - problem.px[:, 1]
+    P = (np.einsum("nij,nj->ni", T[:, :3, :3], state.X[problem.obs_point]) + T[:, :3, 3]).T
+    du, dv = reprojection_errors(problem.camera, P, problem.px.T, MIN_DEPTH_M)
     if problem.px_rate is not None:
         du = du - state.readout_s * problem.px_rate[:, 0]
         dv = dv - state.readout_s * problem.px_rate[:, 1]
     chi2 = (du * du + dv * dv) / problem.sigma_px**2
-    return np.where(P[:, 2] > MIN_DEPTH_M, chi2, np.inf)
+    return np.where(P[2] > MIN_DEPTH_M, chi2, np.inf)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.backend.point_blocks import inverse_factor, times, times_transposed, transposed_times
-from slamdepth.geometry import se3_exp
+from slamdepth.geometry import reprojection_errors, se3_exp
 from slamdepth.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -118,14 +118,12 @@ class Solver:
 
     def _residual(self, state: State) -> tuple[Floats, Floats, Floats]:
         """Whitened residuals ``(3, N)``, robust weights ``(2, N)``, points ``(3, N)`` in the cameras."""
-        camera = self.problem.camera
         P = np.ascontiguousarray(state.X[self.pt].T)
         for T, block in zip(state.T, self.blocks, strict=True):
             P[:, block] = T[:3, :3] @ P[:, block] + T[:3, 3:]
         P[2] = np.maximum(P[2], MIN_DEPTH_M)
         r = np.empty_like(P)
-        r[0] = (camera.fx * P[0] / P[2] + (camera.cx - self.px[0])) * self.inv_sigma_px
-        r[1] = (camera.fy * P[1] / P[2] + (camera.cy - self.px[1])) * self.inv_sigma_px
+        r[:2] = reprojection_errors(self.problem.camera, P, self.px, MIN_DEPTH_M) * self.inv_sigma_px
         if self.px_rate is not None:
             r[:2] -= state.readout_s * self.px_rate * self.inv_sigma_px
         r[2] = (np.log(P[2]) - state.a[self.cam] - self.log_depth) * self.inv_sigma_log

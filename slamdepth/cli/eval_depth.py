@@ -60,8 +60,8 @@ def eval_depth_command(
     from slamdepth.depth.registry import create_depth_model
     from slamdepth.errors import ConfigError, SlamdepthError
     from slamdepth.evaluation import Interval, mean_over_sets
+    from slamdepth.io import writable_file
     from slamdepth.pipeline.depth_data import open_depth_data, thinned
-    from slamdepth.pipeline.folder import writable_file
     from slamdepth.report.depth import judgement_lines, judgement_table, model_lines
 
     if Path(model).is_dir():

@@ -36,8 +36,7 @@ def evaluate_command(
     show_log()
     from slamdepth.errors import ConfigError
     from slamdepth.evaluation import MAX_DIFFERENCE_S, score_trajectory
-    from slamdepth.io import read_tum_trajectory, write_json
-    from slamdepth.pipeline.folder import writable_file
+    from slamdepth.io import read_tum_trajectory, writable_file, write_json
     from slamdepth.report import trajectory_table
 
     for name, value in (("--max-difference", max_difference), ("--fps", fps)):

@@ -60,7 +60,7 @@ def scale_command(
     from slamdepth.depth.scale import check_can_fit, fit_scale
     from slamdepth.depth.scale_file import write_scale
     from slamdepth.errors import DatasetError
-    from slamdepth.pipeline.folder import writable_file
+    from slamdepth.io import writable_file
     from slamdepth.pipeline.prediction_scale import read_with_depth
     from slamdepth.pipeline.sequence_id import sequence_id
     from slamdepth.report import scale_table

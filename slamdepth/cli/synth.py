@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``slamdepth synth``: a rendered sequence with exact depth and poses."""
+"""``slamdepth synth``: render a sequence with exact depth and poses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def synth_command(
     height: Annotated[int | None, typer.Option(metavar="PX", help="Image height. Default: 480")] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Layout, colours, path. Default: 0")] = None,
     texture: Annotated[
-        str | None, typer.Option(metavar="rich|low|bare", help="How much there is to see. Default: rich")
+        str | None, typer.Option(metavar="rich|low|bare", help="Amount of texture. Default: rich")
     ] = None,
     lighting_variation: Annotated[
         float | None, typer.Option(metavar="SHARE", help="Swing of exposure and tint. Default: 0.05")
@@ -29,7 +29,7 @@ def synth_command(
         float | None, typer.Option(metavar="GREY", help="Deviation of the image noise. Default: 1")
     ] = None,
     motion_blur: Annotated[
-        int | None, typer.Option(metavar="N", help="Exposures averaged per frame; 1 = none. Default: 1")
+        int | None, typer.Option(metavar="N", help="Exposures averaged per frame; 1 = no blur. Default: 1")
     ] = None,
     depth_noise: Annotated[
         float | None,
@@ -42,7 +42,7 @@ def synth_command(
 
     Example: slamdepth synth demo/room --frames 300 --seed 1
 
-    The same options give the same files; an interrupted rendering goes on where it stopped.
+    The same options give the same files. An interrupted rendering resumes where it stopped.
     """
     show_log()
     from rich.progress import Progress

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``slamdepth train-depth``: depth heads made."""
+"""``slamdepth train-depth``: train a depth head."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def train_depth_command(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file that describes the training.")],
     device: DeviceOption = "cpu",
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Tell samples, disk space and time, and train nothing.")
+        bool, typer.Option("--dry-run", help="Show samples, disk space and time; train nothing.")
     ] = False,
     search: Annotated[
         int | None,
@@ -29,17 +29,17 @@ def train_depth_command(
 ) -> None:
     """Train a depth head on the DINOv2 backbone's features.
 
-    Example: slamdepth train-depth slamdepth/depth/configs/dinov2_head.yaml --dry-run
+    Example: slamdepth train-depth slamdepth/training/configs/dinov2_head.yaml --dry-run
 
-    A training or search that was killed goes on where it stopped, to the same result.
+    A training or search that was killed resumes where it stopped and gives the same result.
 
-    Data folders that are not absolute lie below $SLAMDEPTH_DATA.
+    Relative data folders are looked up below $SLAMDEPTH_DATA.
 
-    Loss curves, sample predictions and figures go into a folder beside the head.
+    Loss curves, sample predictions and figures are written to a folder next to the head.
     """
     show_log()
     from slamdepth.cli.train_show import plan_lines, plan_table, training_bars, trials_table
-    from slamdepth.pipeline.folder import writable
+    from slamdepth.io import writable
     from slamdepth.pipeline.training import plan_run, report_folder, run_search, run_training
     from slamdepth.training.config import TrainConfig
     from slamdepth.training.output import check_output

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``slamdepth train-depth`` shows: bars while it works, tables of plans, trials and figures."""
+"""Terminal output of ``slamdepth train-depth``: progress bars, tables of plans and trials."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def training_bars(quiet: bool) -> Iterator[Progress]:
-    """A bar a stage, with epoch, loss and the time left; nothing where nobody watches."""
+    """One bar per stage with epoch, loss and remaining time; none if quiet or not a terminal."""
     from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     err = error_console()
@@ -44,21 +44,21 @@ def training_bars(quiet: bool) -> Iterator[Progress]:
 
 
 def plan_table(plan: TrainingPlan) -> Table:
-    """Samples and cache size of each source."""
+    """Table of the samples and cache size of each source."""
     from rich.table import Table
 
     table = Table("places", "used for", title="features to compute", title_justify="left")
     for heading in ("images", "views", "cached", "on disk"):
         table.add_column(heading, justify="right")
     for source in plan.sources:
-        use = "judging" if source.is_held_out else "training"
+        use = "evaluation" if source.is_held_out else "training"
         numbers = (str(source.images), str(source.samples), str(source.cached), _size(source.size_bytes))
         table.add_row(", ".join(source.places), use, *numbers)
     return table
 
 
 def plan_lines(plan: TrainingPlan) -> list[str]:
-    """What a plan says beside its table."""
+    """The lines printed below the table of a plan."""
     views = sum(source.samples for source in plan.sources)
     todo = views - sum(source.cached for source in plan.sources)
     lines = [
@@ -68,7 +68,7 @@ def plan_lines(plan: TrainingPlan) -> list[str]:
     ]
     if plan.features_s is not None and plan.training_s is not None:
         lines.append(
-            f"estimated time, by a batch measured just now: features {_duration(plan.features_s)}, "
+            f"estimated time, from one measured batch: features {_duration(plan.features_s)}, "
             f"training {_duration(plan.training_s)}"
         )
     else:
@@ -79,11 +79,11 @@ def plan_lines(plan: TrainingPlan) -> list[str]:
 
 
 def trials_table(result: SearchResult) -> Table:
-    """Every trial of a search, the best one marked."""
+    """Table of all trials of a search, with the best one marked."""
     from rich.table import Table
 
     names = list(result.trials[0].settings)
-    table = Table("trial", title="held-out AbsRel after one median a view", title_justify="left")
+    table = Table("trial", title="held-out AbsRel after median scaling per view", title_justify="left")
     for heading in (*names, "AbsRel"):
         table.add_column(heading, justify="right")
     for trial in result.trials:

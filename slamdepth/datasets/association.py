@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which measurements of two clocks belong together."""
+"""Association of measurements by time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def associate(
     Args:
         first_s: ``(N,)`` increasing seconds.
         second_s: ``(M,)`` increasing seconds.
-        max_difference_s: pairs this far apart or farther are none.
+        max_difference_s: pairs this far apart or farther are left out.
 
     Returns:
         Pairs ``(index in first, index in second)`` in order of the first.

@@ -1,21 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sequence is, to the rest of the house."""
+"""The :class:`Dataset` protocol: a sequence of frames, read one at a time."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
+from slamdepth.errors import ImageDecodeError
 from slamdepth.types import Camera, Frame, Trajectory
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+_log = logging.getLogger(__name__)
+
 
 @runtime_checkable
 class Dataset(Protocol):
     """A sequence of colour images, read one at a time.
+
+    ``for frame in dataset`` reads them in order. A class that inherits from this one gets the iteration
+    and has to provide the attributes, ``__len__`` and :meth:`read`.
 
     Attributes:
         name: short name, used for run folders.
@@ -46,7 +54,43 @@ class Dataset(Protocol):
                 where this frame has none.
 
         Raises:
-            ImageDecodeError: the image does not decode.
-            CameraError: its size is not the camera's.
+            IndexError: there is no frame ``index``.
+            ImageDecodeError: the image, or the depth image asked for, does not decode.
+            CameraError: the size of either is not the camera's.
         """
         ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Every frame in order, with sensor depth where there is any; see :meth:`frames`."""
+        return self.frames(with_depth=self.has_depth)
+
+    def frames(self, *, with_depth: bool = False) -> Iterator[Frame]:
+        """Read every frame in order.
+
+        A frame whose image does not decode is skipped and a depth image that does not decode is left out,
+        both with a logged warning, as in ``slamdepth run``. ``frame.index`` is the frame's place in the
+        sequence, so skipped frames leave gaps.
+
+        Args:
+            with_depth: also read the sensor depth.
+
+        Raises:
+            CameraError: the size of an image is not the camera's.
+        """
+        for index in range(len(self)):
+            try:
+                frame = _read_with_sound_depth(self, index) if with_depth else self.read(index)
+            except ImageDecodeError as error:
+                _log.warning("image skipped: %s", error)
+            else:
+                yield frame
+
+
+def _read_with_sound_depth(dataset: Dataset, index: int) -> Frame:
+    """The frame ``index``, without its depth where only that does not decode."""
+    try:
+        return dataset.read(index, with_depth=True)
+    except ImageDecodeError as error:
+        frame = dataset.read(index)  # raises again where it is the colour image
+        _log.warning("depth of frame %d left out: %s", index, error)
+        return frame

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image files that are no sequence: one, or a folder of them."""
+"""Image files without a sequence layout: a single one, or a folder of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The images in ``folder``, not in folders below, in the order of people: 2 before 10.
+    """The images in ``folder``, not in folders below, in natural order: 2 before 10.
 
     Raises:
         DatasetError: the folder cannot be read or holds no image.
@@ -34,12 +34,12 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def has_images(folder: Path) -> bool:
-    """True where ``folder`` is one, with an image in it and not only in folders below."""
+    """True where ``folder`` is a folder with an image in it; folders below do not count."""
     return folder.is_dir() and next(_images_in(folder), None) is not None
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sorts names so that numbers in them count as numbers and case does not count."""
+    """Sort key of natural order: numbers within names compare as numbers, and case does not matter."""
     parts = re.split(r"([0-9]+)", name.casefold())
     return [(0, int(part), "") if part[:1].isdecimal() else (1, 0, part) for part in parts if part]
 
@@ -51,15 +51,18 @@ def _images_in(folder: Path) -> Iterator[Path]:
 
 
 def short_names(images: list[Path]) -> list[str]:
-    """A name for each image, no two alike on any file system: without its ending where that does."""
+    """A unique name for each image, also where a file system ignores case: the stem where that suffices."""
     stems = Counter(path.stem.casefold() for path in images)
     return [path.stem if stems[path.stem.casefold()] == 1 else path.name for path in images]
 
 
-def read_picture(path: Path, index: int, given: tuple[Camera, str] | None) -> tuple[Frame, Intrinsics]:
-    """Read an image as frame ``index``, with the ``given`` camera and its origin or what can be found.
+def read_image_frame(path: Path, index: int, given: tuple[Camera, str] | None) -> tuple[Frame, Intrinsics]:
+    """Read an image file as a frame.
 
-    Without a given camera the image is turned upright as its EXIF says.
+    Args:
+        index: the frame's index, and its time in seconds.
+        given: the camera and where it comes from; None takes the focal length from EXIF or guesses it,
+            and turns the image upright as EXIF says.
 
     Raises:
         ImageDecodeError: the image does not decode.

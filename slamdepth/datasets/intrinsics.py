@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The intrinsics of single images, and how sure they are: given, nominal or guessed."""
+"""The intrinsics of single images, and how certain they are: given, nominal or guessed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera
+from slamdepth.calibration import CAMERA_FILE
 from slamdepth.types import Camera
 
 GUESSED_VIEW_DEG = 60.0
@@ -20,7 +20,7 @@ _EXIF_IFD, _FOCAL_LENGTH_35MM = 0x8769, 0xA405
 
 
 class Certainty(str, Enum):
-    """What a focal length rests on."""
+    """Where a focal length comes from."""
 
     GIVEN = "given"
     NOMINAL = "nominal"
@@ -29,11 +29,11 @@ class Certainty(str, Enum):
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A camera, and where it comes from.
+    """A camera, and how certain it is.
 
     Attributes:
         camera: the intrinsics in pixels.
-        how: where they come from, for a reader.
+        how: where they come from, as a user should read it.
         certainty: GIVEN by a file or a known data set, NOMINAL from what the camera wrote
             into the image, or GUESSED.
     """
@@ -51,9 +51,9 @@ def find_camera_file(folder: Path, camera_file: Path | None) -> tuple[Camera, st
         CameraError: the file cannot be read or is malformed.
     """
     if camera_file is not None:
-        return read_camera(camera_file.expanduser()), f"the file {camera_file.name}"
-    beside = folder / CAMERA_FILE
-    return (read_camera(beside), f"{CAMERA_FILE} beside the images") if beside.is_file() else None
+        return Camera.from_file(camera_file.expanduser()), f"the file {camera_file.name}"
+    path = folder / CAMERA_FILE
+    return (Camera.from_file(path), f"{CAMERA_FILE} next to the images") if path.is_file() else None
 
 
 def intrinsics_of(width: int, height: int, focal_35mm: float | None = None) -> Intrinsics:
@@ -81,6 +81,6 @@ def exif_focal_35mm(path: Path) -> float | None:
         with Image.open(path) as image:
             value = image.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_LENGTH_35MM)
         focal_mm = float(value) if value is not None else 0.0
-    except Exception:  # damaged EXIF raises whatever its bytes lead to, and is as good as none
+    except Exception:  # damaged EXIF may raise anything, and counts as none
         return None
     return focal_mm if 0 < focal_mm < 10_000 else None

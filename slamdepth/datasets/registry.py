@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which sequence layouts are known, and which of them a folder has.
+"""Sequence layouts by name, and :func:`open_dataset`, which finds the one a folder has.
 
 A layout is one file in ``slamdepth/datasets/readers/`` with a class under
 ``@register_reader``; the files are imported when the first sequence is opened.
@@ -7,16 +7,14 @@ A layout is one file in ``slamdepth/datasets/readers/`` with a class under
 
 from __future__ import annotations
 
-import importlib
 import logging
-import pkgutil
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 from slamdepth.datasets.base import Dataset
-from slamdepth.datasets.camera_file import read_camera
 from slamdepth.datasets.video import VIDEO_ENDINGS
 from slamdepth.errors import DatasetError
+from slamdepth.registry import Registry
 from slamdepth.types import Camera
 
 _log = logging.getLogger(__name__)
@@ -48,35 +46,38 @@ class Reader(Protocol):
 
 
 _ReaderType = TypeVar("_ReaderType", bound=Reader)
-_readers: dict[str, Reader] = {}
+READERS: Registry[Reader] = Registry(
+    "dataset reader",
+    package="slamdepth.datasets.readers",
+    duplicate="two dataset readers are named '{name}'",
+    error=ValueError,
+)
 _last_reader: list[Reader] = []
 
 
 def register_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
-    """Class decorator that makes a :class:`Reader` known to :func:`open_dataset`."""
+    """Class decorator that makes a :class:`Reader` known to :func:`open_dataset`.
+
+    Raises:
+        ValueError: another reader has its name.
+    """
     reader = reader_type()
-    if reader.name in _readers:
-        raise ValueError(f"two dataset readers are named {reader.name!r}")
-    _readers[reader.name] = reader
+    READERS.add(reader.name, reader, reader_type)
     return reader_type
 
 
 def register_last_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
     """Class decorator for the :class:`Reader` that :func:`open_dataset` asks where no layout matches.
 
-    It is none of :func:`known_readers`, so whoever has an own use for folders of no layout keeps it.
+    :func:`known_readers` leaves it out, for callers that read folders without a layout in their own way.
     """
     _last_reader[:] = [reader_type()]
     return reader_type
 
 
 def known_readers() -> tuple[Reader, ...]:
-    """The reader of every layout, in order of its name."""
-    from slamdepth.datasets import readers
-
-    for module in pkgutil.iter_modules(readers.__path__):
-        importlib.import_module(f"{readers.__name__}.{module.name}")
-    return tuple(_readers[name] for name in sorted(_readers))
+    """The reader of every layout, sorted by name."""
+    return tuple(READERS.get(name) for name in READERS.names())
 
 
 def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dataset:
@@ -96,8 +97,9 @@ def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dat
         if not path.exists():
             what = "video file" if path.suffix.lower() in VIDEO_ENDINGS else "folder"
             raise DatasetError(f"{path}: no such {what}")
-        camera_notes: list[str] = []
-        camera = None if camera_file is None else read_camera(Path(camera_file).expanduser(), camera_notes)
+        camera, camera_notes = None, list[str]()
+        if camera_file is not None:
+            camera = Camera.from_file(Path(camera_file).expanduser(), camera_notes)
         readers = (*known_readers(), *_last_reader)
         for reader in readers:
             if reader.matches(path):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings larger than what tracking is tuned to are reduced, and their camera with them."""
+"""Downscaling of large recordings, and of their camera."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     from slamdepth.types import Camera
 
 LONGEST_SIDE_PX = 640
-"""Larger frames are reduced to it: what tracking is tuned to, and fast enough on a laptop."""
+"""Larger frames are reduced to this, which tracking is tuned to and a laptop is fast enough for."""
 
 
 def reduced_camera(camera: Camera, notes: list[str]) -> Camera:
     """``camera`` for images whose longest side is at most :data:`LONGEST_SIDE_PX`.
 
     Args:
-        notes: takes a line where that is another size.
+        notes: takes a line where the size changes.
     """
     share = min(1.0, LONGEST_SIDE_PX / max(camera.width, camera.height))
     width, height = max(1, round(share * camera.width)), max(1, round(share * camera.height))
@@ -30,7 +30,7 @@ def reduced_camera(camera: Camera, notes: list[str]) -> Camera:
 
 
 def reduced_image(image_rgb: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """``(H, W, 3)`` uint8 at the size of ``camera``."""
+    """``image_rgb (H, W, 3)`` uint8, resized to the size of ``camera``."""
     import cv2
 
     if image_rgb.shape[:2] == (camera.height, camera.width):

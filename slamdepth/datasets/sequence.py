@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.datasets.association import associate
+from slamdepth.datasets.base import Dataset
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
 from slamdepth.io import read_depth_m, read_image_rgb
 from slamdepth.types import Camera, Frame, Trajectory
@@ -22,7 +23,7 @@ MAX_TIME_DIFFERENCE_S = 0.02
 
 
 @dataclass
-class ImageSequence:
+class ImageSequence(Dataset):
     """The :class:`~slamdepth.datasets.base.Dataset` of a folder of image files.
 
     Reading keeps no state, so several threads may read at once.
@@ -30,7 +31,7 @@ class ImageSequence:
     Attributes:
         image_paths: ``N`` colour images.
         depth_paths: ``N`` depth images, None for frames without one.
-        unknown_raw_depth: raw depth values that mean unknown, beside 0.
+        unknown_raw_depth: raw depth values that mean unknown, besides 0.
     """
 
     name: str

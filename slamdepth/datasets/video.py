@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.errors import DatasetError, ImageDecodeError
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,7 +28,7 @@ class VideoFile:
         path: the file.
         width, height: of a frame in pixels, turned upright as the file says.
         fps: frames per second; 30 where the file does not say, with a note.
-        frames_named: how many frames the file says it has, which may be wrong; 0 = does not say.
+        frames_named: number of frames by the file's header, which may be wrong; 0 where it has none.
         notes: what was guessed, one line each.
 
     Raises:
@@ -39,7 +40,7 @@ class VideoFile:
 
         if not path.is_file():
             raise DatasetError(f"{path}: no such video file")
-        # FFmpeg's own complaints, like OpenCV's in _open, would stand between progress bar and our one line.
+        # FFmpeg prints errors of its own, as OpenCV does in _open; they would break the progress bar.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         self.path = path
         self.notes: list[str] = []
@@ -59,11 +60,11 @@ class VideoFile:
         self.fps = fps
         self.frames_named = round(named) if 0 < named < 1e9 else 0
 
-    def timestamps_s(self) -> NDArray[np.float64]:
-        """``(N,)`` times of all frames in seconds from the first; the video is decoded once for it.
+    def timestamps_s(self) -> Floats:
+        """``(N,)`` times of all frames in seconds from the first; reads the whole video once.
 
-        A phone's frames do not come at equal intervals, so each says its own time. Where times do not
-        increase, they are counted by :attr:`fps`, with a note.
+        A phone's frames do not come at equal intervals, so the time of each is read. Where times do not
+        increase, they follow from :attr:`fps`, with a note.
         """
         import cv2
 
@@ -73,17 +74,17 @@ class VideoFile:
                 times_s.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
         finally:
             capture.release()
-        told = np.array(times_s)
-        if len(told) > 1 and not (np.diff(told) > 0).all():
+        found: Floats = np.array(times_s)
+        if len(found) > 1 and not (np.diff(found) > 0).all():
             self.notes.append(f"the times of the video's frames do not increase; {self.fps:g} Hz is assumed")
-            return np.arange(len(told)) / self.fps
-        return told - told[0]
+            return np.asarray(np.arange(len(found)) / self.fps)
+        return np.asarray(found - found[0])
 
     def frames(self, stride: int = 1) -> Iterator[tuple[int, Callable[[], NDArray[np.uint8]]]]:
         """Every ``stride``-th frame: its number from 0, and a function that decodes it.
 
-        The function gives ``(H, W, 3)`` uint8 RGB and may be called before the next frame is
-        asked for; a frame that is not wanted costs less that way.
+        The function returns ``(H, W, 3)`` uint8 RGB and may be called until the next frame is taken.
+        Frames that are not decoded cost less.
 
         Raises:
             ImageDecodeError: from the function, the frame does not decode.

@@ -1,30 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth models by name; a model's module is imported when it is first asked for.
 
-A new model is one new module next to this one whose class (or factory) carries
-``@register("its-name")``, and one line in ``_MODULES``. A package of its own adds one by an
+A new model is a module of this package whose class (or factory) carries
+``@register("its-name")``, and a line in ``_MODULES``. A package of its own adds one by an
 entry point of the group ``slamdepth.depth_models``, whose name is the model's and whose
 object is such a factory.
 """
 
 from __future__ import annotations
 
-import importlib
 import inspect
-import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.checkpoints import check_device, check_device_name
 from slamdepth.errors import ConfigError
+from slamdepth.registry import Registry
 from slamdepth.types import DepthKind
-
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
-
-logger = logging.getLogger(__name__)
 
 Factory = Callable[..., DepthModel]
 
@@ -45,7 +38,9 @@ _MODULES = {
     **dict.fromkeys(_OFFICIAL, "slamdepth.depth.dinov2_official"),
     **dict.fromkeys(_DEPTH_ANYTHING, "slamdepth.depth.depth_anything"),
 }
-_factories: dict[str, Factory] = {}
+MODELS: Registry[Factory] = Registry(
+    "depth model", modules=_MODULES, entry_points=ENTRY_POINTS, reserved=(_ONNX, _MIRRORED)
+)
 
 
 def register(name: str) -> Callable[[Factory], Factory]:
@@ -53,22 +48,19 @@ def register(name: str) -> Callable[[Factory], Factory]:
 
     It is called as ``factory(device=..., seed=...)``, and with ``weights=Path`` where the
     user names a weights file and the factory has such an argument.
+
+    Raises:
+        ConfigError: another depth model has the name.
     """
-
-    def add(factory: Factory) -> Factory:
-        if name in _factories and _factories[name].__module__ != factory.__module__:
-            raise ConfigError(f"two depth models are called '{name}'")
-        _factories[name] = factory
-        return factory
-
-    return add
+    return MODELS.register(name)
 
 
 def depth_model_names() -> list[str]:
     """Every name :func:`create_depth_model` takes, the default first; ``onnx:FILE`` stands for any file,
     ``mirrored:MODEL`` for any of the others."""
-    others = sorted({*_factories, *_plugins()} - set(_MODULES))
-    return [*_MODULES, f"{_ONNX}FILE", *others, f"{_MIRRORED}MODEL"]
+    names = MODELS.names()
+    own, others = names[: len(_MODULES)], names[len(_MODULES) :]
+    return [*own, f"{_ONNX}FILE", *others, f"{_MIRRORED}MODEL"]
 
 
 def is_depth_model_name(name: str) -> bool:
@@ -107,14 +99,14 @@ def create_depth_model(
 
         return create(name.removeprefix(_ONNX), device=device, seed=seed)
     check_device(device)
-    if name not in _factories and name in _MODULES:
-        importlib.import_module(_MODULES[name])
-    if name not in _factories:
-        plugins = _plugins().get(name)
-        if plugins is None:
-            raise ConfigError(f"unknown depth model '{name}'; choose from: {', '.join(depth_model_names())}")
-        return _from_plugin(name, plugins, device, seed, weights)
-    return _call(name, _factories[name], device, seed, weights)
+    model = _call(name, MODELS.get(name, depth_model_names), device, seed, weights)
+    plugin = MODELS.plugin(name)
+    if plugin is not None and not (isinstance(model, DepthModel) and isinstance(model.kind, DepthKind)):
+        raise ConfigError(
+            f"depth model '{name}': its plug-in {plugin.value} makes no depth model with name, kind, "
+            "weights and predict"
+        )
+    return model
 
 
 def _call(name: str, factory: Factory, device: str, seed: int, weights: str | Path | None) -> DepthModel:
@@ -124,38 +116,3 @@ def _call(name: str, factory: Factory, device: str, seed: int, weights: str | Pa
     if "weights" not in parameters and not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         raise ConfigError(f"depth model '{name}' takes no weights file")
     return factory(device=device, seed=seed, weights=Path(weights))
-
-
-def _plugins() -> dict[str, list[EntryPoint]]:
-    """Entry points of other packages by name; names of models here are not theirs to take."""
-    from importlib.metadata import entry_points
-
-    found: dict[str, list[EntryPoint]] = {}
-    for point in entry_points(group=ENTRY_POINTS):
-        if point.name in _MODULES or point.name.startswith((_ONNX, _MIRRORED)):
-            logger.warning("depth model '%s' of %s is ignored: the name is taken", point.name, point.value)
-            continue
-        found.setdefault(point.name, []).append(point)
-    return found
-
-
-def _from_plugin(
-    name: str, points: list[EntryPoint], device: str, seed: int, weights: str | Path | None
-) -> DepthModel:
-    if len(points) > 1:
-        raise ConfigError(f"two plug-ins add depth model '{name}': {', '.join(p.value for p in points)}")
-    try:
-        factory: Any = points[0].load()
-    except Exception as error:  # whatever a foreign module raises when imported
-        raise ConfigError(
-            f"depth model '{name}': its plug-in {points[0].value} cannot be loaded: {error}"
-        ) from error
-    if not callable(factory):
-        raise ConfigError(f"depth model '{name}': its plug-in {points[0].value} is no factory")
-    model = _call(name, factory, device, seed, weights)
-    if not isinstance(model, DepthModel) or not isinstance(model.kind, DepthKind):
-        raise ConfigError(
-            f"depth model '{name}': its plug-in {points[0].value} makes no depth model with name, kind, "
-            "weights and predict"
-        )
-    return model

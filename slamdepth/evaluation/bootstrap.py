@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How sure a figure over the frames of a sequence is, whose neighbours are alike.
+"""Confidence intervals of statistics over the frames of a sequence, which are correlated in time.
 
-Frames are drawn again in blocks of neighbours, so that what they have in common stays in the
-sample: the moving-block bootstrap (Kuensch, Annals of Statistics 1989) with blocks that wrap
+Frames are resampled in blocks of neighbours, so that their correlation stays in the sample: the
+moving-block bootstrap (Kuensch, Annals of Statistics 1989) with blocks that wrap
 around, so that every frame is drawn as often (Politis and Romano 1992).
 """
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 
 
 FEWEST_FRAMES = 8
-"""Of fewer frames no interval is given."""
+"""No interval is given for fewer frames."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure and where it lies with 95 % confidence.
+    """A figure and its 95 % confidence interval.
 
     Attributes:
         value: over all frames; NaN where no frame has the figure.
-        low, high: bounds, or None where there are too few frames to tell.
+        low, high: bounds, or None where there are too few frames.
     """
 
     value: float
@@ -40,9 +40,9 @@ class Interval:
 
 
 def block_length(frames: int) -> int:
-    """Frames a block: the root of their number, rounded up.
+    """Frames per block: the square root of their number, rounded up.
 
-    It grows with their number and still leaves about as many blocks as a block has frames.
+    Blocks grow with the sequence, and there are about as many of them as each has frames.
     """
     return math.ceil(math.sqrt(max(1, frames)))
 
@@ -83,12 +83,12 @@ def interval(
     """The 95 % percentile interval of a statistic over frames.
 
     Args:
-        values: ``(N,)`` figures of frames in order of time; NaN where a frame has none. Those
-            are left out first, so blocks may then span a gap.
+        values: ``(N,)`` figures of frames in order of time; NaN where a frame has none. NaNs are
+            left out first, so a block may span a gap.
         statistic: of ``(..., N)`` over the last axis, as ``np.std``; default: the mean.
-        block: frames a block; default: :func:`block_length`.
+        block: frames per block; default: :func:`block_length`.
         draws: samples drawn.
-        seed: of the draws; the same gives the same bounds.
+        seed: of the draws.
     """
     known = np.asarray(values, dtype=np.float64)
     known = known[np.isfinite(known)]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The short score of depth maps beside a sensor's, for the report of a run: errors, scaled three ways.
+"""The short score of depth maps against a sensor's, for the report of a run: errors, scaled three ways.
 
-Frame by frame and in bounded memory; what takes whole maps or says how sure a figure is, is in
-:mod:`slamdepth.evaluation.depth_judge`, of the same pixels and with the same errors.
+It is computed frame by frame in bounded memory. :mod:`slamdepth.evaluation.depth_judge` adds measures of
+whole maps and confidence intervals, of the same pixels and errors.
 
-Each figure is computed inside a frame and then averaged over the frames, so that a frame
-counts the same however many of its pixels the sensor saw. The measures are those of
+Each figure is computed inside a frame and then averaged over the frames, so that frames weigh
+alike however many of their pixels the sensor saw. The measures are those of
 Eigen, Puhrsch and Fergus, "Depth map prediction from a single image using a multi-scale
 deep network", NIPS 2014. Nothing is clamped.
 """
@@ -50,7 +50,7 @@ class DepthErrors:
 
 @dataclass(frozen=True)
 class DepthScore:
-    """How good the depth of a sequence is, judged three ways.
+    """Accuracy of the depth of a sequence, scaled three ways.
 
     Attributes:
         metric: as predicted.
@@ -74,7 +74,7 @@ class DepthScore:
     coverage: float
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures as nested plain numbers."""
+        """The figures as nested dicts of numbers."""
         return asdict(self)
 
 
@@ -82,12 +82,12 @@ class DepthScorer:
     """Collects frames and scores them at the end.
 
     The factor of ``sequence_median`` is known only at the end, so samples are kept as
-    float32 pairs. When more than ``max_samples`` are held, every second one of each frame
+    float32 pairs. When there are more than ``max_samples``, every second one of each frame
     is dropped and later frames are thinned alike; the other figures use every sample.
 
     Args:
         min_m, max_m, stride: see :class:`~slamdepth.evaluation.depth_pixels.ComparedPixels`.
-        max_samples: upper bound of samples held.
+        max_samples: upper bound of samples kept.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class DepthScorer:
         self.max_samples = max_samples
         self._compared = ComparedPixels(min_m=min_m, max_m=max_m, stride=stride)
         self._samples: list[tuple[Floats32, Floats32]] = []
-        self._held = 0
+        self._kept = 0
         self._thinning = 1
         self._metric: list[DepthErrors] = []
         self._frame_median: list[DepthErrors] = []
@@ -156,11 +156,11 @@ class DepthScorer:
     def _keep(self, predicted: Floats32, sensor: Floats32) -> None:
         kept = (predicted[:: self._thinning].copy(), sensor[:: self._thinning].copy())
         self._samples.append(kept)
-        self._held += len(kept[0])
-        while self._held > max(self.max_samples, len(self._samples)):
+        self._kept += len(kept[0])
+        while self._kept > max(self.max_samples, len(self._samples)):
             self._thinning *= 2
             self._samples = [(p[::2].copy(), s[::2].copy()) for p, s in self._samples]
-            self._held = sum(len(p) for p, _ in self._samples)
+            self._kept = sum(len(p) for p, _ in self._samples)
 
 
 def depth_errors(predicted_m: NDArray[np.floating], sensor_m: NDArray[np.floating]) -> DepthErrors:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what a model's numbers mean to metres, by the sensor's own depth; for judging only."""
+"""Alignment of predicted depth to the sensor's, for evaluation only."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def affine_fit(depth: Values, sensor_m: Values, kind: DepthKind) -> tuple[float,
     """Factor and shift that bring a prediction closest to the sensor, by least squares.
 
     In depth, or in inverse depth (1/m) for inverse kinds, as Ranftl et al. (MiDaS, TPAMI
-    2022) do; every pixel weighs the same. A prediction without relief gets the factor 0.
+    2022) do; every pixel weighs the same. A constant prediction gets the factor 0.
 
     Args:
         depth: ``(N,)`` of :func:`~slamdepth.evaluation.depth_pixels.as_depth`, positive.
@@ -43,8 +43,8 @@ def affine_fit(depth: Values, sensor_m: Values, kind: DepthKind) -> tuple[float,
 def apply_affine(
     depth: Values, fit: tuple[float, float], kind: DepthKind, min_m: float, max_m: float
 ) -> NDArray[np.float64]:
-    """Metres of a prediction after :func:`affine_fit`, held within ``min_m`` to ``max_m``: a
-    shift can push depth below 0, or inverse depth beyond infinity. 0 stays 0."""
+    """Metres of a prediction after :func:`affine_fit`, clipped to ``min_m`` to ``max_m``: a
+    shift can make depth or inverse depth negative. 0, unknown, stays 0."""
     known = depth > 0
     fitted = fit[0] * _linear(np.where(known, depth, 1.0), kind) + fit[1]
     if kind is DepthKind.AFFINE_INVERSE_DEPTH:
@@ -58,8 +58,8 @@ def _linear(depth: Values, kind: DepthKind) -> NDArray[np.float64]:
 
 
 def fitted_to_sensor(values: Values, kind: DepthKind, sensor_m: Values) -> NDArray[np.float64]:
-    """One frame's prediction in metres, to look at: after the median, or the affine fit where
-    its numbers are no metres. ``(H, W)``, 0 where there is none."""
+    """One frame's prediction in metres, for images: scaled by the median, or by the affine fit where
+    it is not metric. ``(H, W)``, 0 where there is none."""
     depth = as_depth(values, kind)
     compared = ComparedPixels(stride=1).take(values, sensor_m, kind)
     if compared is None:

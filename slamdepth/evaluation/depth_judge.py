@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The long judgement of a depth model beside a sensor, for ``eval-depth``: scaled four ways, with intervals.
+"""Full evaluation of a depth model against a sensor, for ``eval-depth``: scaled four ways, with intervals.
 
-Edges, structure and the affine fit need whole maps, intervals every frame's figures; a run's report
-does without, see :mod:`slamdepth.evaluation.depth`. Pixels and errors are the same there.
+Edges, structure and the affine fit need whole maps, intervals need the figures of every frame.
+:mod:`slamdepth.evaluation.depth` is the short score for the report of a run, of the same pixels and errors.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class OverDepth:
         edges_m: ``BINS + 1`` bounds of the bins, evenly spaced in log depth.
         pixels: pixels in each bin.
         abs_rel: way of scaling to the mean AbsRel in each bin, None where it is empty.
-        log_bias: the same of the mean natural logarithm of predicted / sensor.
+        log_bias: way of scaling to the mean natural logarithm of predicted / sensor in each bin.
     """
 
     edges_m: tuple[float, ...]
@@ -55,20 +55,20 @@ class OverDepth:
 
 @dataclass(frozen=True)
 class DepthJudgement:
-    """What predicted depth is worth. Figures are means over frames, with 95 % intervals.
+    """Accuracy of predicted depth. Figures are means over frames, with 95 % intervals.
 
     Attributes:
         kind: what the model's numbers mean.
         ways: way of scaling, of :data:`WAYS`, to figure, of :data:`FIGURES`, to its value.
-            Without ``as_predicted`` where the numbers are no metres. ``abs_rel``, ``rmse_m``
+            Without ``as_predicted`` where the model is not metric. ``abs_rel``, ``rmse_m``
             (metres), ``log_rmse``, ``delta1`` to ``delta3``: see
             :class:`~slamdepth.evaluation.depth.DepthErrors`; ``ssim``, ``edge_f1``,
             ``edge_error_px``: see :mod:`slamdepth.evaluation.depth_maps`.
         fitted_in: what ``frame_affine`` is linear in.
         sequence_factor: the one factor of ``sequence_median``: median of sensor / predicted.
         scale_spread: standard deviation over the frames of the log of the frame's factor.
-        surest_half: AbsRel of each frame's surest half of pixels over that of all of them,
-            after a median a frame; 1 = says nothing. None where the model gives no sigma.
+        surest_half: AbsRel of the half of each frame's pixels with the smaller sigma over that of all
+            of them, after scaling by the frame's median; 1 where sigma is uninformative. None without sigma.
         within_one_sigma: share of pixels whose log error, as predicted, is below sigma; 0.68
             where sigma is calibrated. None without sigma or metres.
         over_depth: errors by depth.
@@ -92,13 +92,12 @@ class DepthJudgement:
     per_frame: dict[str, tuple[float, ...]]
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures as nested plain values; NaN where a frame lacks a figure."""
+        """The figures as nested dicts and numbers; NaN where a frame lacks a figure."""
         return {**asdict(self), "kind": self.kind.value}
 
 
 def mean_over_sets(judgements: Sequence[DepthJudgement]) -> dict[str, dict[str, float]]:
-    """Means of :attr:`DepthJudgement.ways` over data sets, each of which counts the same; NaN
-    where a set lacks the figure."""
+    """Unweighted means of :attr:`DepthJudgement.ways` over data sets; NaN where a set lacks the figure."""
     return {
         way: {name: float(np.mean([j.ways[way][name].value for j in judgements])) for name in FIGURES}
         for way in WAYS
@@ -107,10 +106,10 @@ def mean_over_sets(judgements: Sequence[DepthJudgement]) -> dict[str, dict[str, 
 
 
 class DepthJudge:
-    """Collects predictions and judges them at the end.
+    """Collects predictions and evaluates them at the end.
 
-    The factor of ``sequence_median`` is known only at the end, so maps wait in a temporary
-    file, in memory up to 256 MiB; everything else is small.
+    The factor of ``sequence_median`` is known only at the end, so maps are kept in a temporary
+    file, which stays in memory up to 256 MiB.
 
     Args:
         kind: what the predictions' numbers mean.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How alike two depth maps are as pictures: structure and edges, on known pixels alone.
+"""Structural similarity and edge accuracy of depth maps, on known pixels only.
 
-Sensor depth has holes, most of them where an edge is. Both figures are defined so that they
-equal the published ones where there is no hole, and use what is known around one.
+Sensor depth has holes, most of them at edges. Both measures equal the published ones where there is no
+hole, and use the known pixels around one.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _K1, _K2 = 0.01, 0.03
 _NO_WEIGHT = 1e-12
 
 JUMPS = np.linspace(1.05, 1.25, 10)
-"""Ratios of depth that count as an edge, each weighted by itself."""
+"""Ratios of depth that count as an edge; each is also its own weight."""
 LOCATED_JUMP = 1.10
-"""The ratio whose edges are located for the distance in pixels."""
+"""The ratio at which edges are located for the distance in pixels."""
 REFERENCE_WIDTH = 640
 LARGEST_GAP_PX, LARGEST_DISTANCE_PX = 20, 10.0
-"""In pixels of an image 640 wide; others in proportion."""
+"""In pixels of an image 640 wide; scaled in proportion for others."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def edge_score(predicted_m: Map, sensor_m: Map, known: Bools) -> EdgeScore | Non
     an edge where the depth of one is more than ``t`` times the other's, to the left, right,
     above and below each on its own, for t from 1.05 to 1.25. Two changes: neighbours are each
     known pixel and the next known one of its row or column, up to 20 pixels on, so that an
-    edge with a sensor's shadow beside it still is one; and the four directions are counted
+    edge next to a sensor's shadow still counts; and the four directions are counted
     together, so that a perfect map has 1 whichever of them occur.
 
     ``error_px`` is after the depth boundary errors of iBims-1 (Koch et al., ECCV workshops

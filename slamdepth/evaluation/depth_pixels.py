@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pixels of a predicted depth map are compared with a sensor's; the same for all that compares."""
+"""The pixels of a predicted depth map that are compared with a sensor's, for all scores alike."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 MIN_M, MAX_M = 0.1, 10.0
 """Sensor depths outside are not compared."""
 STRIDE = 4
-"""Every so-manieth pixel of every so-manieth row is compared."""
+"""One pixel in each square of this edge is compared."""
 
 
 def as_depth(values: Values, kind: DepthKind) -> Floats:
     """Values of ``kind`` as depth up to a factor; 0 where there is none.
 
-    Inverse depth is inverted as if its shift were 0. What is 0, negative or not finite is
-    no prediction.
+    Inverse depth is inverted as if its shift were 0. Values that are 0, negative or not finite
+    are no prediction.
     """
     values = np.asarray(values, dtype=np.float64)
     known = np.isfinite(values) & (values > 0)
@@ -43,7 +43,7 @@ class FramePixels:
         sensor_m: ``(N,)``, positive.
         ratios: ``(N,)`` sensor / predicted.
         factor: their median.
-        where: ``(H, W)`` of the frame, True where compared, in whose order the others are.
+        where: ``(H, W)`` bool, True where compared; the other arrays are in its order.
     """
 
     depth: Floats
@@ -95,8 +95,8 @@ class ComparedPixels:
         """Pick the pixels of one frame.
 
         Args:
-            values: ``(H, W)`` predictions of ``kind``; what is 0, negative or not finite is
-                none, and only lowers ``coverage``.
+            values: ``(H, W)`` predictions of ``kind``; values that are 0, negative or not finite
+                are no prediction and only lower ``coverage``.
             sensor_m: ``(H, W)`` metres of the same pixels; 0 where unknown.
 
         Returns:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the depths of a data set are spread, counted image by image in bounded memory."""
+"""Distribution of the depths of a data set, counted image by image in bounded memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 BIN_M = 0.001
 """Width of a bin: percentiles are exact to half of it."""
 END_M = 200.0
-"""Depth beyond counts with the last bin, and in the maximum as it is."""
+"""Larger depths count in the last bin; the maximum is exact."""
 PERCENTILES = (1, 5, 50, 95, 99)
 
 
@@ -25,7 +25,7 @@ class DepthStatistics:
     Attributes:
         images, pixels: how many were added.
         known: pixels that have a depth.
-        known_shares: of each image the share of its pixels that have one.
+        known_shares: share of the pixels with depth in each image.
         nearest_m, farthest_m: the exact extremes.
     """
 
@@ -38,7 +38,7 @@ class DepthStatistics:
     _counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(round(END_M / BIN_M), np.int64))
 
     def add(self, depth_m: NDArray[np.floating]) -> None:
-        """Count an image ``(H, W)`` of metres; what is 0, negative or not finite is unknown."""
+        """Count an image ``(H, W)`` of metres; values that are 0, negative or not finite are unknown."""
         known_m = depth_m[np.isfinite(depth_m) & (depth_m > 0)].astype(np.float64)
         self.images += 1
         self.pixels += depth_m.size
@@ -64,7 +64,7 @@ class DepthStatistics:
         return np.diff(below[places])
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures as plain numbers; None where no pixel has a depth."""
+        """The figures as a dict of numbers; None where no pixel has a depth."""
         return {
             "images": self.images,
             "pixels": self.pixels,

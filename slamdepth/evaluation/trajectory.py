@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Score an estimated trajectory against a ground truth, with evo.
 
-The only module that imports evo, which is GPL-3.0: everything else sees plain numbers.
+The only module that imports evo, which is GPL-3.0; everything else sees the numbers it returns.
 Only ``evo.core`` is used, because the rest of evo writes a settings file into the home
 directory when it is imported.
 
@@ -108,7 +108,7 @@ class TrajectoryScore:
     per_second: RelativeError | None
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures as ``{"ate": ..., "rpe": ...}`` of plain numbers, None where unknown."""
+        """The figures as ``{"ate": ..., "rpe": ...}`` of numbers, None where unknown."""
         return {
             "ate": {
                 "se3": _statistics(self.se3),
@@ -192,7 +192,7 @@ def score_trajectory(
 
 
 def _to_evo(trajectory: Trajectory, name: str) -> Any:
-    """An evo trajectory that shares nothing with ours."""
+    """A copy as an evo trajectory."""
     from evo.core.trajectory import PoseTrajectory3D
 
     if len(trajectory) == 0:
@@ -253,7 +253,7 @@ def _relative_error(truth: Any, estimate: Any, *, delta: int) -> RelativeError:
 
 
 def _poses_per_second(trajectory: Trajectory) -> float:
-    """Rate from the median spacing of the times, which dropped frames do not move."""
+    """Rate from the median spacing of the times, which is robust to dropped frames."""
     spacing = float(np.median(np.diff(trajectory.timestamps_s))) if len(trajectory) > 1 else 0.0
     return 1.0 / spacing if spacing > 0 else 1.0
 

@@ -3,8 +3,8 @@
 
 Vizzo et al., "KISS-ICP: In Defense of Point-to-Point ICP - Simple, Accurate, and Robust
 Registration If Done the Right Way", RA-L 2023, through the package ``kiss-icp``, whose
-own defaults are a lidar's. Each pose is polished point-to-plane before the map takes it
-in: the narrow view of a depth camera on walls makes point-to-point ICP drag behind.
+own defaults are a lidar's. Each pose is refined by point-to-plane ICP before the cloud enters the
+map: in the narrow view of a depth camera on walls, point-to-point ICP lags behind.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ class CloudOdometryConfig:
 
     Attributes:
         min_m, max_m: nearer and farther points, by range from the camera, are dropped.
-        voxel_size_m: edge of a voxel of the local map; clouds are thinned to half of it
-            for the map and to one and a half for the registration.
+        voxel_size_m: edge of a voxel of the local map; clouds are subsampled at half of it
+            for the map and at one and a half for the registration.
         points_per_voxel: points kept in a voxel of the local map.
         initial_threshold_m: expected error of the constant-velocity prediction at first;
             it adapts to what was seen, and correspondences are searched up to three times it.
         min_motion_m: smaller errors of the prediction do not adapt the threshold.
         min_points: a cloud with fewer points is not registered.
-        iterations: upper bound of ICP iterations a cloud.
+        iterations: upper bound of ICP iterations per cloud.
         polish: point-to-plane steps after ICP; none with ``rounds=0``.
-        tree_every: the search tree of the polish is built anew every so many clouds.
+        tree_every: the search tree of the refinement is rebuilt after this many clouds.
         convergence: ICP ends with a step shorter than this, in metres and radians.
     """
 
@@ -93,12 +93,12 @@ class CloudOdometry:
         within = (range_m > self.config.min_m) & (range_m < self.config.max_m)
         if np.count_nonzero(within) < self.config.min_points:
             return None
-        pose = self._step(cloud_c[within])
+        pose: Floats = self._step(cloud_c[within]).copy()
         self._clouds += 1
-        return pose.copy()
+        return pose
 
     def _step(self, cloud_c: Floats) -> Floats:
-        """KISS-ICP's own step, with the polish between its registration and its map."""
+        """KISS-ICP's own step, with the refinement between its registration and its map."""
         icp = self._icp
         source_c, for_map_c = icp.voxelize(cloud_c)
         guess = orthonormalised(icp.last_pose @ icp.last_delta)

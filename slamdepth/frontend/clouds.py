@@ -25,7 +25,7 @@ def depth_to_cloud(
     max_m: float = 5.0,
     max_jump: float = 0.03,
 ) -> Floats:
-    """Points of a depth image, lens distortion undone, pixels on depth edges dropped.
+    """Points of a depth image, undistorted and without pixels on depth edges.
 
     Args:
         depth_m: ``(H, W)`` metres along z, 0 = unknown, in raw pixels of ``camera``.
@@ -47,13 +47,13 @@ def depth_to_cloud(
     z = depth_m[np.ix_(rows, columns)].astype(np.float64)
     keep = (z > min_m) & (z < max_m)  # False for NaN
     for row_step, column_step in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        beside = depth_m[
+        neighbour_m = depth_m[
             np.ix_(
                 np.clip(rows + row_step, 0, camera.height - 1),
                 np.clip(columns + column_step, 0, camera.width - 1),
             )
         ]
-        keep &= ~(beside > 0) | (np.abs(beside - z) <= max_jump * z)
+        keep &= ~(neighbour_m > 0) | (np.abs(neighbour_m - z) <= max_jump * z)
     return _rays(camera, stride)[keep] * z[keep][:, None]
 
 

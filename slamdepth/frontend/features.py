@@ -7,8 +7,6 @@ An extractor is one file in ``slamdepth/frontend/extractors/`` with a class unde
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +20,7 @@ from slamdepth.errors import ConfigError, TrackingError, WeightsError
 from slamdepth.frontend.matching import PixelGrid, match_all
 from slamdepth.frontend.metric import ORB, DescriptorMetric
 from slamdepth.io import sha256_of
+from slamdepth.registry import Registry
 from slamdepth.types import Camera, WeightsInfo
 from slamdepth.typing import Floats, Ints
 
@@ -31,12 +30,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ScaleLevels:
-    """The sizes features come in.
+    """The scale levels of an extractor's keypoints.
 
     Attributes:
-        factor: a level's size over that of the one before.
-        count: how many there are.
-        growth: the place of a keypoint gets unsure with this power of its size.
+        factor: ratio of a level's size to that of the previous one.
+        count: number of levels.
+        growth: a keypoint's standard deviation grows with this power of its size.
     """
 
     factor: float
@@ -44,16 +43,17 @@ class ScaleLevels:
     growth: float = 1.0
 
     def of(self, size: Floats) -> Ints:
-        """Level of keypoints ``(N,)`` that are so many times as large as the finest; may be past the last."""
-        return np.maximum(np.rint(np.log(size) / np.log(self.factor)), 0).astype(np.int64)
+        """Levels ``(N,)`` of keypoints of these sizes, 1 being the finest; may be past the last level."""
+        levels: Ints = np.maximum(np.rint(np.log(size) / np.log(self.factor)), 0).astype(np.int64)
+        return levels
 
     def sigma_px(self, octave: Ints) -> Floats:
-        """Deviation of a keypoint's place where one pixel is that of the finest level."""
+        """Standard deviations ``(N,)`` of keypoints in pixels; one pixel at the finest level."""
         return self.factor ** (self.growth * octave.astype(np.float64))
 
 
 class ImageMatcher(Protocol):
-    """Matches two whole images by more than each descriptor alone."""
+    """Matches the features of two images jointly, as LightGlue does."""
 
     def __call__(self, a: Features, b: Features) -> tuple[Ints, Ints]:
         """Pairs, as indices ``(P,)`` in ``a`` and ``b``, one to one."""
@@ -71,9 +71,9 @@ class Features:
         sigma_px: ``(N,)`` float64 standard deviation of ``px``.
         descriptors: ``(N, D)``, of the width and type that ``metric`` is for.
         metric: how descriptors are compared.
-        orb_words: finds ORB descriptors ``(M, 32)`` of the same image, for place
+        orb_descriptors: gives ORB descriptors ``(M, 32)`` of the same image, for place
             recognition; None where ``descriptors`` are ORB's.
-        matcher: matches whole images; None compares descriptors one by one.
+        matcher: matches whole images; None compares descriptors pairwise.
 
     Raises:
         TrackingError: the descriptors are not those of the metric.
@@ -85,7 +85,7 @@ class Features:
     sigma_px: Floats
     descriptors: NDArray[Any]
     metric: DescriptorMetric = ORB
-    orb_words: Callable[[], NDArray[np.uint8]] | None = None
+    orb_descriptors: Callable[[], NDArray[np.uint8]] | None = None
     matcher: ImageMatcher | None = None
 
     def __post_init__(self) -> None:
@@ -101,20 +101,20 @@ class Features:
 
     @cached_property
     def grid(self) -> PixelGrid:
-        """``px`` sorted into cells; made once, since a keyframe is searched again and again."""
+        """``px`` in a grid of cells; cached, as a keyframe is searched many times."""
         return PixelGrid(self.px)
 
     @property
     def place_descriptors(self) -> NDArray[np.uint8]:
-        """ORB descriptors ``(M, 32)`` of the image: what places are recognised by."""
-        return self.descriptors if self.orb_words is None else self.orb_words()
+        """ORB descriptors ``(M, 32)`` of the image, for place recognition."""
+        return self.descriptors if self.orb_descriptors is None else self.orb_descriptors()
 
     def match(self, other: Features, among: Ints, *, ratio: float) -> tuple[Ints, Ints]:
-        """Match the keypoints ``among`` of this image with all of another, wherever they are.
+        """Match the keypoints ``among`` of this image with all of another, anywhere in it.
 
         Args:
-            among: ``(K,)`` indices, ascending, each once.
-            ratio: a match is so much nearer than the second; unless ``matcher`` decides.
+            among: ``(K,)`` unique indices, ascending.
+            ratio: of Lowe's test; not used where there is a ``matcher``.
 
         Returns:
             Pairs as indices into ``among`` and into ``other``, one to one.
@@ -151,22 +151,27 @@ class _Known(NamedTuple):
     needs_weights: bool
 
 
-_EXTRACTORS: dict[str, _Known] = {}
+EXTRACTORS: Registry[_Known] = Registry(
+    "feature",
+    package="slamdepth.frontend.extractors",
+    unknown="features.name: no feature is called '{name}'; known: {choices}",
+)
 
 
 def register_extractor(
     name: str, *, needs_weights: bool = False
 ) -> Callable[[ExtractorFactory], ExtractorFactory]:
-    """Make an extractor available as ``features.name`` in the settings.
+    """Class decorator: make an extractor available as ``features.name`` in the settings.
 
     Args:
         needs_weights: it is a network, whose file ``features.weights`` names.
+
+    Raises:
+        ConfigError: another feature has the name.
     """
 
     def register(factory: ExtractorFactory) -> ExtractorFactory:
-        if name in _EXTRACTORS:
-            raise ConfigError(f"two features are called '{name}'")
-        _EXTRACTORS[name] = _Known(factory, needs_weights)
+        EXTRACTORS.add(name, _Known(factory, needs_weights), factory)
         return factory
 
     return register
@@ -174,11 +179,7 @@ def register_extractor(
 
 def feature_names() -> list[str]:
     """Every name :func:`create_extractor` knows, in order."""
-    from slamdepth.frontend import extractors
-
-    for module in pkgutil.iter_modules(extractors.__path__):
-        importlib.import_module(f"{extractors.__name__}.{module.name}")
-    return sorted(_EXTRACTORS)
+    return EXTRACTORS.names()
 
 
 def needs_weights(name: str) -> bool:
@@ -187,14 +188,7 @@ def needs_weights(name: str) -> bool:
     Raises:
         ConfigError: no extractor has that name; lists those that exist.
     """
-    return _looked_up(name).needs_weights
-
-
-def _looked_up(name: str) -> _Known:
-    names = feature_names()
-    if name not in names:
-        raise ConfigError(f"features.name: no feature is called '{name}'; known: {', '.join(names)}")
-    return _EXTRACTORS[name]
+    return EXTRACTORS.get(name).needs_weights
 
 
 def create_extractor(config: FeatureConfig) -> FeatureExtractor:
@@ -205,7 +199,7 @@ def create_extractor(config: FeatureConfig) -> FeatureExtractor:
             OpenCV lacks it, or it needs a weights file or takes none.
         WeightsError: its weights are missing or of another layout.
     """
-    known = _looked_up(config.name)
+    known = EXTRACTORS.get(config.name)
     files = [name for name in (config.weights, config.matcher) if name is not None]
     if known.needs_weights and config.weights is None:
         raise ConfigError(
@@ -220,37 +214,6 @@ def create_extractor(config: FeatureConfig) -> FeatureExtractor:
 
 
 def feature_weights(config: FeatureConfig) -> tuple[WeightsInfo, ...]:
-    """The files of networks that ``config`` names; what they were trained on they do not say."""
+    """The weights files that ``config`` names; what they were trained on is unknown."""
     files = [Path(name).expanduser() for name in (config.weights, config.matcher) if name is not None]
     return tuple(WeightsInfo(file.stem, sha256_of(file), "unknown", "unknown") for file in files)
-
-
-def spread(px: Floats, response: Floats, count: int, cell_px: float) -> Ints:
-    """Choose ``count`` keypoints evenly: every cell's best first, then every cell's second.
-
-    Args:
-        px: ``(N, 2)`` pixels.
-        response: ``(N,)`` strength.
-        count: how many to keep.
-        cell_px: edge of a cell in pixels.
-
-    Returns:
-        Indices, at most ``count``, in ascending order.
-    """
-    if len(px) <= count:
-        return np.arange(len(px))
-    cells = np.floor(px / cell_px).astype(np.int64)
-    cell = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
-    order = np.lexsort((-response, cell))
-    sorted_cell = cell[order]
-    starts = np.flatnonzero(np.r_[True, sorted_cell[1:] != sorted_cell[:-1]])
-    rank = np.arange(len(px)) - np.repeat(starts, np.diff(np.r_[starts, len(px)]))
-    rank_of = np.empty(len(px), dtype=np.int64)
-    rank_of[order] = rank
-    chosen = np.lexsort((-response, rank_of))[:count]
-    return np.sort(chosen)
-
-
-def cell_edge_px(gray: NDArray[np.uint8], count: int) -> float:
-    """Edge of a cell for :func:`spread`: about two keypoints a cell."""
-    return float(np.sqrt(gray.shape[0] * gray.shape[1] / count) * 1.5)

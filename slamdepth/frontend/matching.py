@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matching of descriptors, near a predicted place or over whole images."""
+"""Matching of descriptors, near predicted pixels or over whole images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MAX_CELLS = 256  # along a side
 
 
 class PixelGrid:
-    """Pixels sorted into square cells, so that those near a place are found without looking at all.
+    """Pixels in a grid of square cells, for fast search of those near given positions.
 
     Args:
         px: ``(N, 2)`` pixels.
@@ -46,7 +46,7 @@ class PixelGrid:
 
         Args:
             query_px: ``(M, 2)``; radius_px: ``(M,)`` pixels.
-            half_px: ``(M, 2)`` how far along each axis to look; pairs beyond may be left out.
+            half_px: ``(M, 2)`` half extent of the search along each axis; pairs beyond may be left out.
 
         Returns:
             Two index arrays of equal length, sorted by query.
@@ -74,7 +74,7 @@ class PixelGrid:
 
 
 def _expand(lengths: Ints) -> tuple[Ints, Ints]:
-    """Every item as often as its length says: its index, and 0, 1, 2 ... within it."""
+    """Each item repeated ``lengths`` times: its index, and 0, 1, 2 ... within it."""
     index = np.repeat(np.arange(len(lengths)), lengths)
     return index, np.arange(len(index)) - (np.cumsum(lengths) - lengths)[index]
 
@@ -84,8 +84,8 @@ def best_matches(
 ) -> tuple[Ints, Ints, Ints]:
     """Reduce scored pairs to a one-to-one matching.
 
-    A query keeps its nearest target when that is near enough and clearly nearer than
-    its second (Lowe's ratio); a target wanted by several keeps the nearest.
+    A query keeps its nearest target where that is near enough and clearly nearer than the
+    second (Lowe's ratio test); a target of several queries keeps the nearest.
 
     Args:
         query, target: ``(P,)`` indices below 2^22 and 2^30.

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far two descriptors are from one another, and how near they must be to show one point.
+"""Distances between descriptors, and the thresholds of a match.
 
-A distance is an integer from 0 to :data:`FARTHEST`, whatever the descriptor: so matching
-sorts pairs by one packed number and knows nothing of bits and floats.
+A distance is an integer from 0 to :data:`FARTHEST` for every kind of descriptor, so that matching
+sorts pairs by one packed number.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -21,18 +22,18 @@ if TYPE_CHECKING:
     Descriptors = NDArray[Any]
 
 FARTHEST = 1023
-"""No distance is larger; what is farther is given as this."""
+"""The largest distance; larger ones are clipped to it."""
 
-_BLOCK = 16  # rows of a table whose parts stay in a core's cache
+_BLOCK = 16  # descriptors against 2,000 others: the block stays in a core's second-level cache
 _UNIT = FARTHEST / 2.0  # two unit vectors are at most 2 apart
 
 
 class DescriptorMetric(Protocol):
-    """What matching knows of descriptors.
+    """The distance between two descriptors of one kind, and its thresholds.
 
     Attributes:
-        max_distance: two descriptors farther apart are never one point.
-        strict_distance: the same where a wrong match would stay in the map.
+        max_distance: largest distance of a match.
+        strict_distance: largest distance where a wrong match would stay in the map.
     """
 
     @property
@@ -56,10 +57,11 @@ class DescriptorMetric(Protocol):
 
 @dataclass(frozen=True)
 class Hamming:
-    """Bits that differ between binary descriptors ``(N, size)`` uint8.
+    """Hamming distance of binary descriptors ``(N, size)`` uint8.
 
     Attributes:
-        size: bytes of a descriptor; a multiple of 8 is fastest, see :func:`whole_words`.
+        size: bytes per descriptor; a multiple of 8 is fastest, see :func:`whole_words`.
+        max_distance, strict_distance: see :class:`DescriptorMetric`.
     """
 
     size: int = 32
@@ -110,16 +112,17 @@ class UnitL2:
 
 
 def _steps(cosine: Floats32) -> Floats32:
-    """The distance of unit vectors by their inner product, whole steps of 2 / 1023."""
-    return np.rint(np.sqrt(np.clip(2.0 - 2.0 * cosine, 0.0, 4.0)) * np.float32(_UNIT))
+    """Distances of unit vectors from their inner products, in whole steps of 2 / 1023."""
+    steps: Floats32 = np.rint(np.sqrt(np.clip(2.0 - 2.0 * cosine, 0.0, 4.0)) * np.float32(_UNIT))
+    return steps
 
 
 ORB = Hamming(32, 64, 50)
-"""Of ORB's 256 bits."""
+"""The metric of ORB's 256 bits."""
 
 
 def whole_words(descriptors: Bytes) -> Bytes:
-    """Binary descriptors ``(..., D)`` filled up with zeros to a multiple of 8 bytes."""
+    """Binary descriptors ``(..., D)`` padded with zeros to a multiple of 8 bytes."""
     rest = -descriptors.shape[-1] % 8
     if rest == 0:
         return np.ascontiguousarray(descriptors)
@@ -128,22 +131,51 @@ def whole_words(descriptors: Bytes) -> Bytes:
 
 
 def hamming(a: Bytes, b: Bytes) -> Ints:
-    """Bits that differ between descriptors ``(..., D)`` uint8 of any length, row by row."""
+    """Hamming distances of descriptors ``(..., D)`` uint8 of any length, row by row."""
     xor = whole_words(a).view(np.uint64) ^ whole_words(b).view(np.uint64)
     bits = np.bitwise_count(xor)
-    total = bits[..., 0].astype(np.int64)
+    total: Ints = bits[..., 0].astype(np.int64)
     for word in range(1, bits.shape[-1]):  # additions of columns beat a sum along the short axis
         total += bits[..., word]
     return total
 
 
 def hamming_table(a: Bytes, b: Bytes) -> NDArray[np.uint16]:
-    """``(N, M)`` bits that differ between all descriptors ``(N, D)`` and ``(M, D)``."""
+    """Hamming distances ``(N, M)`` of all descriptors ``(N, D)`` from all ``(M, D)``."""
+    table = np.empty((len(a), len(b)), dtype=np.uint16)
+    for start, distances in _hamming_blocks(a, b):
+        table[start : start + len(distances)] = distances
+    return table
+
+
+def hamming_nearest(a: Bytes, b: Bytes) -> NDArray[np.intp]:
+    """Index ``(N,)`` of the descriptor in ``b (M, D)`` that is nearest to each in ``a (N, D)``.
+
+    Ties go to the lowest index. Memory does not grow with ``N`` times ``M``.
+    """
+    index = np.empty(len(a), dtype=np.intp)
+    for start, distances in _hamming_blocks(a, b):
+        index[start : start + len(distances)] = distances.argmin(axis=1)
+    return index
+
+
+def _hamming_blocks(a: Bytes, b: Bytes) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+    """Hamming distances of ``a (N, D)`` from ``b (M, D)``, block by block.
+
+    Yields:
+        Index of the block's first descriptor in ``a``, and distances ``(n, M)`` in a reused buffer.
+    """
     wide_a = whole_words(a).view(np.uint64)
     wide_b = np.ascontiguousarray(whole_words(b).view(np.uint64).T)
-    table = np.zeros((len(a), len(b)), dtype=np.uint16)
+    differing = np.empty((_BLOCK, len(b)), dtype=np.uint64)
+    bits = np.empty((_BLOCK, len(b)), dtype=np.uint8)
+    distances = np.empty((_BLOCK, len(b)), dtype=np.uint16)  # 256 does not fit uint8
     for start in range(0, len(a), _BLOCK):
         block = wide_a[start : start + _BLOCK]
+        n = len(block)
+        distances[:n] = 0
         for word, column in enumerate(wide_b):
-            table[start : start + _BLOCK] += np.bitwise_count(block[:, word, None] ^ column)
-    return table
+            np.bitwise_xor(block[:, word, None], column, out=differing[:n])
+            np.bitwise_count(differing[:n], out=bits[:n])
+            distances[:n] += bits[:n]
+        yield start, distances[:n]

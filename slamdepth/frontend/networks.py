@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCV's feature networks: opened with clear errors, and LightGlue to match whole images."""
+"""OpenCV's feature networks with clear errors, and LightGlue, which matches whole images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from slamdepth.typing import Ints
 
 
 class LightGlue:
-    """LightGlue (Lindenberger et al. 2023): matches keypoints with regard to all others of both images.
+    """LightGlue (Lindenberger et al. 2023), which matches all keypoints of two images jointly.
 
     Its graph takes ``kpts0`` and ``kpts1`` ``(1, N, 2)`` in -1 to 1, ``desc0`` and ``desc1``
     ``(1, N, D)``, and gives ``matches0`` ``(M, 2)`` int64 and ``mscores0`` ``(M,)``.
@@ -53,8 +53,8 @@ class LightGlue:
             found = self._network.match(a.descriptors, b.descriptors)
         q = np.array([m.queryIdx for m in found], dtype=np.int64)
         t = np.array([m.trainIdx for m in found], dtype=np.int64)
-        doubt = np.clip([m.distance * FARTHEST for m in found], 0, FARTHEST).astype(np.int64)
-        q, t, _ = best_matches(q, t, doubt, max_distance=FARTHEST, ratio=1.0)
+        distance = np.clip([m.distance * FARTHEST for m in found], 0, FARTHEST).astype(np.int64)
+        q, t, _ = best_matches(q, t, distance, max_distance=FARTHEST, ratio=1.0)
         return q, t
 
 
@@ -76,7 +76,7 @@ def network_class(name: str) -> Any:
 
 @contextmanager
 def clear_errors(path: Path, what: str) -> Iterator[None]:
-    """OpenCV's errors about a network as one line, its warnings not at all.
+    """Turn OpenCV's errors about a network into one line, and silence its warnings.
 
     Raises:
         WeightsError: OpenCV could not read or run the file ``path``.

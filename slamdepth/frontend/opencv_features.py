@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What OpenCV's features have in common: detect widely, describe, keep an even share."""
+"""Extractors made of OpenCV's ``Feature2D``: many keypoints are detected, an even share is kept."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slamdepth.errors import ConfigError
-from slamdepth.frontend.features import Features, ScaleLevels, cell_edge_px, spread
+from slamdepth.frontend.features import Features, ScaleLevels
+from slamdepth.frontend.keypoints import cell_edge_px, pixels, responses, spread
 from slamdepth.frontend.metric import DescriptorMetric
-from slamdepth.frontend.orb_descriptors import OrbWords
+from slamdepth.frontend.orb_descriptors import OrbDescriptors
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
@@ -24,9 +24,9 @@ class OpenCvExtractor:
 
     Args:
         algorithm: set so that it finds more than ``count`` in most images.
-        count: keypoints kept of an image.
-        metric: of what :meth:`descriptors` returns.
-        levels: sizes of keypoints; larger than the last are dropped.
+        count: keypoints kept per image.
+        metric: of the descriptors that :meth:`descriptors` returns.
+        levels: scale levels; larger keypoints than those of the last are dropped.
         finest_px: ``cv2.KeyPoint.size`` of level 0.
     """
 
@@ -62,7 +62,7 @@ class OpenCvExtractor:
             sigma_px=self.levels.sigma_px(octave),
             descriptors=self.descriptors(described[kept]) if len(kept) else self._metric.empty(),
             metric=self._metric,
-            orb_words=OrbWords(gray, self._count),
+            orb_descriptors=OrbDescriptors(gray, self._count),
         )
 
     def descriptors(self, described: NDArray[Any]) -> NDArray[Any]:
@@ -71,7 +71,7 @@ class OpenCvExtractor:
 
 
 def opencv_class(name: str, feature: str) -> Any:
-    """OpenCV's class ``name``, wherever this version keeps it.
+    """OpenCV's class ``name``, from whichever module this version has it in.
 
     Raises:
         ConfigError: this build lacks it; says which package brings it.
@@ -88,25 +88,11 @@ def opencv_class(name: str, feature: str) -> Any:
     )
 
 
-def pixels(keypoints: Sequence[Any]) -> Floats:
-    """Where OpenCV's keypoints are, ``(N, 2)``."""
-    import cv2
-
-    if len(keypoints) == 0:
-        return np.zeros((0, 2))
-    return np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
-
-
-def responses(keypoints: Sequence[Any]) -> Floats:
-    """How strong OpenCV's keypoints are, ``(N,)``."""
-    return np.array([k.response for k in keypoints], dtype=np.float64)
-
-
 def _first_of_each(px: Floats) -> NDArray[np.int64]:
-    """Indices of the keypoints that share their place with none before.
+    """Indices of the first keypoint at each pixel.
 
-    SIFT describes one place once for each direction it may have; as two features at one
-    pixel they would become two map points.
+    SIFT describes one pixel once for each orientation it may have; two features at one pixel would
+    become two landmarks.
     """
     _, first = np.unique(px, axis=0, return_index=True)
     return np.sort(first)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last millimetres of a registration: point-to-plane ICP, and how well it is held.
+"""Point-to-plane ICP, which refines a registration, and how well geometry constrains it.
 
 Chen and Medioni, "Object modelling by registration of multiple range images", 1992.
-Point-to-point ICP between thinned clouds pulls a slowly moving camera back to where it was
+Point-to-point ICP between subsampled clouds pulls a slowly moving camera back
 (each point of a wall finds a neighbour on the wall nearby); distances to planes do not.
 """
 
@@ -22,35 +22,35 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PolishConfig:
-    """What point-to-plane ICP may cost.
+    """Settings of point-to-plane ICP.
 
     Attributes:
-        rounds: Gauss-Newton steps, correspondences found anew for each.
-        points: about so many points of the cloud are used; more only cost time.
-        neighbours: map points that make a tangent plane.
+        rounds: Gauss-Newton steps, each with new correspondences.
+        points: approximate number of points of the cloud that are used.
+        neighbours: map points that define a tangent plane.
         min_points: with fewer correspondences the pose is left as it is.
-        min_held: a direction whose observability (see :func:`fit_quality`) is less is left as it is.
+        min_observability: the pose is not moved along directions with less, see :func:`fit_quality`.
     """
 
     rounds: int = 3
     points: int = 600
     neighbours: int = 12
     min_points: int = 50
-    min_held: float = 0.005
+    min_observability: float = 0.005
 
 
 def polish(
     tree: cKDTree, cloud_c: Floats, T_world_camera: Floats, *, reach_m: float, config: PolishConfig
 ) -> tuple[Floats, float]:
-    """Move a nearly registered cloud onto the tangent planes of a map.
+    """Refine the pose of a nearly registered cloud by point-to-plane ICP.
 
-    Directions that the geometry does not hold are not moved along (Zhang, Kaess and Singh,
+    The pose is not moved along directions that the geometry does not constrain (Zhang, Kaess and Singh,
     "On degeneracy of optimization-based state estimation problems", 2016).
 
     Args:
         tree: over the map's points in the world frame, metres.
         cloud_c: ``(N, 3)`` points in the camera frame, metres.
-        T_world_camera: ``(4, 4)``, right to within ``reach_m``.
+        T_world_camera: ``(4, 4)``, correct to within ``reach_m``.
 
     Returns:
         The pose and the length of the last step in metres; the pose as it was and infinity
@@ -66,9 +66,9 @@ def polish(
         rows, centre, radius_m = _rows(points, surface.normal)
         weighted = rows * weight[:, None] / len(rows)
         values, vectors = np.linalg.eigh(weighted.T @ rows)
-        held = 3.0 * values >= config.min_held
-        gradient = vectors[:, held].T @ (weighted.T @ surface.distance_m)
-        step = -vectors[:, held] @ (gradient / values[held])
+        observable = 3.0 * values >= config.min_observability
+        gradient = vectors[:, observable].T @ (weighted.T @ surface.distance_m)
+        step = -vectors[:, observable] @ (gradient / values[observable])
         moved = np.eye(4)
         moved[:3, :3] = so3_exp(step[:3] / radius_m)
         moved[:3, 3] = centre + step[3:] - moved[:3, :3] @ centre
@@ -86,7 +86,7 @@ def fit_quality(
     to the map's tangent planes. Observability is three times the smallest eigenvalue of the
     mean normal matrix of point-to-plane ICP, rotations taken about the centre and lengths in
     radii of the cloud (after Gelfand et al., "Geometrically stable sampling for the ICP
-    algorithm", 2003); the matrix of point-to-point ICP does not see that a plane slides
+    algorithm", 2003); the matrix of point-to-point ICP does not show that a plane slides
     along itself.
     """
     points, fitness = _matched(tree, cloud_w, inlier_m, config)
@@ -101,12 +101,12 @@ def fit_quality(
 
 @dataclass(frozen=True)
 class _Surface:
-    """Tangent planes of the map beside some points.
+    """Tangent planes of the map near some points.
 
     Attributes:
         normal: ``(N, 3)`` unit normals.
         distance_m: ``(N,)`` signed distances of the points from their planes.
-        flatness: ``(N,)`` 1 for a perfect plane, 0 for noise, whose normal says nothing.
+        flatness: ``(N,)`` 1 for a perfect plane, 0 for noise, whose normal is arbitrary.
     """
 
     normal: Floats
@@ -115,8 +115,8 @@ class _Surface:
 
 
 def _surface(tree: cKDTree, points_w: Floats, config: PolishConfig) -> _Surface:
-    _, beside = tree.query(points_w, k=min(config.neighbours, tree.n))
-    patches = np.asarray(tree.data)[beside]
+    _, neighbours = tree.query(points_w, k=min(config.neighbours, tree.n))
+    patches = np.asarray(tree.data)[neighbours]
     middle = patches.mean(axis=1)
     spread = patches - middle[:, None]
     variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of one camera from points of the map whose depth may be uncertain.
+"""The pose of one camera from landmarks whose depth may be uncertain.
 
-A point born from a predicted depth is sure across its ray and unsure along it. Its
-covariance is carried into the image, so that its residual counts fully across the
-epipolar line and little along it: the same code is PnP for a well triangulated map,
-and essentially epipolar geometry plus a weak depth for a fresh one.
+A landmark initialised from predicted depth is certain across its ray and uncertain along it. Its
+covariance is propagated to the image, so that its residual weighs fully across the
+epipolar line and little along it: this is PnP for a well triangulated map, and
+essentially epipolar geometry with a weak depth for a new one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.geometry import se3_exp
+from slamdepth.geometry import CHI2_2DOF_95, reprojection_errors, se3_exp
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
@@ -22,12 +22,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-CHI2_2DOF_95 = 5.991
 HUBER = 1.345
 _NEAREST_M = 0.02
 _CONVERGED = 1e-5  # metres and radians: a hundredth of a pixel
-_SETTLING = 2e-4  # enough to tell outliers by
-_REWHITEN = 0.01  # metres and radians within which a point's doubt looks the same
+_ROUGHLY_CONVERGED = 2e-4  # enough to classify outliers
+_REWHITEN = 0.01  # metres and radians of motion that leave a point's covariance in the image alike
 
 
 @dataclass(frozen=True)
@@ -66,21 +65,21 @@ def pixel_covariance(
 def _pixel_covariance(
     camera: Camera, R_camera_world: Floats, points_c: Floats, covariance_w: Floats, sigma_px: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """The three numbers ``(N,)`` of each symmetric covariance; ``points_c`` is ``(3, N)``.
+    """Elements uu, uv and vv ``(N,)`` of each symmetric covariance; ``points_c`` is ``(3, N)``.
 
-    Written out by coordinate, here and below: NumPy is slow at many tiny matrices.
+    Written out by coordinate, as NumPy is slow at many tiny matrices.
     """
     x, y, z = points_c
     right, down, forward = R_camera_world
     along_u = (camera.fx / z)[:, None] * (right - (x / z)[:, None] * forward)
     along_v = (camera.fy / z)[:, None] * (down - (y / z)[:, None] * forward)
-    doubt_u = np.einsum("nij,nj->ni", covariance_w, along_u)
-    doubt_v = np.einsum("nij,nj->ni", covariance_w, along_v)
+    covariance_u = np.einsum("nij,nj->ni", covariance_w, along_u)
+    covariance_v = np.einsum("nij,nj->ni", covariance_w, along_v)
     noise = sigma_px * sigma_px
     return (
-        np.einsum("ni,ni->n", along_u, doubt_u) + noise,
-        np.einsum("ni,ni->n", along_u, doubt_v),
-        np.einsum("ni,ni->n", along_v, doubt_v) + noise,
+        np.einsum("ni,ni->n", along_u, covariance_u) + noise,
+        np.einsum("ni,ni->n", along_u, covariance_v),
+        np.einsum("ni,ni->n", along_v, covariance_v) + noise,
     )
 
 
@@ -99,10 +98,10 @@ def refine_pose(
     """Robust Gauss-Newton on the reprojection error, whitened by every point's covariance.
 
     Args:
-        T_camera_world: ``(4, 4)`` start.
+        T_camera_world: ``(4, 4)`` initial pose.
         points_w: ``(N, 3)`` m; covariance_w: ``(N, 3, 3)`` m^2.
         px: ``(N, 2)`` undistorted pixels; sigma_px: ``(N,)``.
-        rounds: outliers are judged anew after each; Huber kernel in all but the last.
+        rounds: outliers are re-classified after each; Huber kernel in all but the last.
         gate: squared whitened residual beyond which a match is an outlier.
     """
     match = _Matches(camera, points_w.T.copy(), covariance_w, px.T.copy(), sigma_px)
@@ -120,7 +119,7 @@ def refine_pose(
                 H, g = part.normal_equations(part.seen_from(T), W, robust=robust)
                 step = _newton_step(H, g)
                 T = se3_exp(step) @ T
-                if np.abs(step).max() < (_SETTLING if robust else _CONVERGED):
+                if np.abs(step).max() < (_ROUGHLY_CONVERGED if robust else _CONVERGED):
                     break
         P = match.seen_from(T)
         if np.abs(T - T_whitened).max() > _REWHITEN:
@@ -130,17 +129,19 @@ def refine_pose(
 
 
 def _newton_step(H: Floats, g: Floats) -> Floats:
-    """``-H^-1 g`` for ``H (6, 6)``; LAPACK at once, as NumPy's checks take longer than the solution."""
+    """``-H^-1 g`` for ``H (6, 6)``, by LAPACK directly: NumPy's checks take longer than the solution."""
     from scipy.linalg.lapack import dposv
 
     damped = H.copy()
     damped.flat[::7] += 1e-9 * H.trace()
     _, step, info = dposv(damped, g)
-    return -step if info == 0 else -np.linalg.lstsq(damped, g, rcond=None)[0]
+    if info != 0:
+        step = np.linalg.lstsq(damped, g, rcond=None)[0]
+    return np.asarray(-step, dtype=np.float64)
 
 
 class _Matches:
-    """Points and where they were seen, one array a coordinate."""
+    """Points and their measurements, one row per coordinate."""
 
     def __init__(
         self, camera: Camera, points_w: Floats, covariance_w: Floats, px: Floats, sigma_px: Floats
@@ -163,9 +164,9 @@ class _Matches:
         return T_camera_world[:3, :3] @ self.points_w + T_camera_world[:3, 3:]
 
     def whitening(self, T_camera_world: Floats, points_c: Floats) -> Floats:
-        """Lower triangular W with W S W^T = I: ``(3, N)`` its numbers 00, 10 and 11.
+        """Lower triangular W with W S W^T = I: its elements 00, 10 and 11 as ``(3, N)``.
 
-        Those of points that are not in front of the camera mean nothing.
+        They are meaningless for points that are not in front of the camera.
         """
         ahead = points_c.copy()
         ahead[2] = np.maximum(ahead[2], _NEAREST_M)
@@ -178,15 +179,12 @@ class _Matches:
         return np.stack([a, -b * a * c, c])
 
     def residual(self, points_c: Floats, whitening: Floats) -> tuple[Floats, Floats]:
-        """Whitened residuals ``(N,)`` of the two rows."""
-        camera = self.camera
-        z = np.maximum(points_c[2], _NEAREST_M)
-        du = camera.fx * points_c[0] / z + (camera.cx - self.px[0])
-        dv = camera.fy * points_c[1] / z + (camera.cy - self.px[1])
+        """Whitened residuals ``(N,)`` of the two coordinates."""
+        du, dv = reprojection_errors(self.camera, points_c, self.px, _NEAREST_M)
         return whitening[0] * du, whitening[1] * du + whitening[2] * dv
 
     def squared_residual(self, points_c: Floats, whitening: Floats) -> Floats:
-        """``(N,)``, chi-square with two degrees of freedom where all is well."""
+        """Squared whitened residuals ``(N,)``; chi-square with two degrees of freedom for inliers."""
         ru, rv = self.residual(points_c, whitening)
         return ru * ru + rv * rv
 
@@ -214,7 +212,7 @@ class _Matches:
 def pose_from_scratch(
     camera: Camera, points_w: Floats, px: Floats, *, seed: int, threshold_px: float = 6.0, minimum: int = 12
 ) -> tuple[Floats, NDArray[np.bool_]] | None:
-    """PnP without a start, by a robust consensus (OpenCV's USAC local optimisation, MSAC score).
+    """PnP without an initial pose, by RANSAC (OpenCV's USAC with local optimisation and MSAC score).
 
     Returns:
         ``(T_camera_world, inliers (N,))``, or None where no pose has ``minimum`` inliers.

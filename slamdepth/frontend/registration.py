@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Registration of one cloud to a local map: the rescue where too few features match.
+"""Registration of one cloud to a local map, the fallback where too few features match.
 
-The search is KISS-ICP's (see :mod:`slamdepth.frontend.cloud_odometry`). A pose found this
-way is only worth something with a verdict, so the result says how well it fits and
-whether the geometry holds it in every direction.
+The search is KISS-ICP's (see :mod:`slamdepth.frontend.cloud_odometry`). The result says how well the
+cloud fits, whether the geometry constrains the pose in every direction, and whether to trust it.
 """
 
 from __future__ import annotations
@@ -33,14 +32,14 @@ _POLISH = PolishConfig(rounds=6, points=1500, neighbours=20)
 
 @dataclass(frozen=True)
 class RegistrationConfig:
-    """How a cloud is registered to a local map, and when the result is trusted.
+    """Settings of the registration, and bounds of a result that is trusted.
 
     Attributes:
         voxel_size_m: edge of a voxel; map and cloud are thinned to half of it.
-        search_m: correspondences are searched so far at first, then within two voxels.
+        search_m: search radius of correspondences at first; then it is two voxels.
         min_points: with fewer points on either side nothing is registered.
         min_fitness, max_rmse_m, min_observability: bounds of what is trusted.
-        max_moved_m, max_turned_rad: farthest that a trusted result lies from the guess.
+        max_moved_m, max_turned_rad: largest distance of a trusted result from the guess.
     """
 
     voxel_size_m: float = 0.05
@@ -55,16 +54,16 @@ class RegistrationConfig:
 
 @dataclass(frozen=True)
 class RegistrationResult:
-    """Where a cloud lies in a local map, and how far to trust it.
+    """The pose of a cloud in a local map, and how reliable it is.
 
     Attributes:
         T_world_camera: ``(4, 4)``; the guess where there was too little to register.
         fitness: share of the cloud's points with a map point within a voxel's size.
         rmse_m: root mean square distance of those points from the map's surface.
-        observability: from 0 to about 1, how well the geometry holds the direction of
-            motion that it holds least; 0 for a plane, along which a cloud slides freely.
-        converged: the last round of polishing hardly moved the cloud.
-        is_trusted: the verdict on all of these and the distance from the guess.
+        observability: from 0 to about 1, how well the geometry constrains the least constrained
+            direction of motion; 0 for a plane, along which a cloud slides freely.
+        converged: the last step of the refinement hardly moved the cloud.
+        is_trusted: all of these and the distance from the guess are within bounds.
     """
 
     T_world_camera: Floats
@@ -83,13 +82,13 @@ def register_cloud(
 ) -> RegistrationResult:
     """Register a cloud to the points of a local map.
 
-    KISS-ICP's point-to-point registration from coarse to fine, which has a wide basin, then
-    a few steps of point-to-plane ICP, which does not mind that thinned points never coincide.
+    KISS-ICP's point-to-point registration from coarse to fine, which has a wide basin of convergence,
+    then a few steps of point-to-plane ICP, which does not need subsampled points to coincide.
 
     Args:
         local_map_w: ``(M, 3)`` points in the world frame, metres.
         cloud_c: ``(N, 3)`` points in the camera frame, metres.
-        T_world_camera_guess: ``(4, 4)``, which should bring most points to within ``search_m``.
+        T_world_camera_guess: ``(4, 4)``, which should bring most points to within ``search_m`` of the map.
 
     Raises:
         TrackingError: a cloud or the guess has another shape or is not finite.

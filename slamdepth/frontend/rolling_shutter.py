@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a rolling shutter's pixels would be, had the whole image been taken at once.
+"""Rolling-shutter correction: pixels moved to where they would be at the time of the middle row.
 
 Webcams, phones and the Kinect read an image row by row, the last row some 15 to 30 ms after
-the first. A turning camera bends such an image: at 60 degrees a second and 25 ms its upper
+the first. Rotation distorts such an image: at 60 degrees a second and 25 ms its upper
 and lower edges are off by 0.75 degrees, seven pixels of a 640 pixel wide image. Taken for a
-rigid image, that is motion that never was. With the camera's velocity, every pixel can be
-moved to where it would be at the time of the middle row (Ringaby and Forssén, "Efficient
+rigid image, it shows spurious motion. The camera's velocity gives the correction of every
+pixel (Ringaby and Forssén, "Efficient
 Video Rectification and Stabilisation for Cell-Phones", IJCV 2012; here with translation).
 """
 
@@ -22,23 +22,23 @@ _STEP_S = 1e-3  # of the difference quotient; the motion is linear in it but for
 
 
 def row_phase(raw_px: Floats, camera: Camera) -> Floats:
-    """When pixels ``(N, 2)`` of the image as taken are read, ``(N,)``: -0.5 the first row, 0.5 the last.
+    """When raw pixels ``(N, 2)`` are read out, ``(N,)``: -0.5 for the first row, 0.5 for the last.
 
-    A sensor's rows run along its longer side. So those of an upright image, of a phone say, are its columns.
+    A sensor's rows run along its longer side, so in an upright image, such as a phone's, they are columns.
     """
     axis, rows = (1, camera.height) if camera.width >= camera.height else (0, camera.width)
     return np.asarray(raw_px[:, axis] / rows - 0.5, dtype=np.float64)
 
 
 def velocity_between(T_camera_world_a: Floats, T_camera_world_b: Floats, interval_s: float) -> Floats:
-    """Constant velocity that leads from one pose to another.
+    """Constant velocity between two poses.
 
     Args:
         T_camera_world_a, T_camera_world_b: ``(4, 4)``.
         interval_s: time from a to b.
 
     Returns:
-        ``(6,)``: m/s and rad/s in the camera's own axes, of b or, the same to first order, a.
+        ``(6,)``: m/s and rad/s in the camera's own axes, equal for a and b to first order.
     """
     R_world_a, R_world_b = T_camera_world_a[:3, :3].T, T_camera_world_b[:3, :3].T
     turn = so3_log(R_world_a.T @ R_world_b)
@@ -48,7 +48,7 @@ def velocity_between(T_camera_world_a: Floats, T_camera_world_b: Floats, interva
 
 
 def inverse_depth(T_camera_world: Floats, points_w: Floats) -> Floats:
-    """``(N,)`` 1/m of points ``(N, 3)`` in a camera; what lies behind it is taken to be near."""
+    """Inverse depth ``(N,)`` in 1/m of points ``(N, 3)`` in a camera; points behind it count as near."""
     return np.asarray(1.0 / np.maximum(transform(T_camera_world, points_w)[:, 2], _NEAREST_M))
 
 

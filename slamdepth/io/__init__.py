@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files in and out: TUM trajectories, images, point clouds, text, JSON and checksums."""
+"""Files in and out: cameras, TUM trajectories, images, point clouds, text, JSON and checksums."""
 
 from __future__ import annotations
 
+from slamdepth.io.camera import write_camera
 from slamdepth.io.hashing import sha256_of
 from slamdepth.io.images import (
     read_depth_m,
@@ -12,6 +13,7 @@ from slamdepth.io.images import (
     write_npy,
     write_png,
 )
+from slamdepth.io.outputs import writable, writable_file
 from slamdepth.io.ply import encode_ply, write_point_cloud
 from slamdepth.io.text import parse_float, read_lines, replacing, write_json, write_text
 from slamdepth.io.trajectory import (
@@ -33,6 +35,9 @@ __all__ = [
     "read_tum_trajectory",
     "replacing",
     "sha256_of",
+    "writable",
+    "writable_file",
+    "write_camera",
     "write_depth_mm",
     "write_json",
     "write_npy",

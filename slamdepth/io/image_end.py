@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether an image file reaches its image's end, whatever a camera has appended behind it."""
+"""Detection of truncated PNG and JPEG files, also where a camera has appended data to the image."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _JPEG_SEGMENT = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")
 
 
 def is_cut_short(data: bytes) -> bool:
-    """True for the bytes of a PNG or JPEG that end before its first image does; of others nothing is known.
+    """True for the bytes of a PNG or JPEG that end before its first image does; False for other formats.
 
-    OpenCV fills the missing rows of such an image with grey and says nothing.
+    OpenCV fills the missing rows of such an image with grey, without an error.
     """
     if data.startswith(_PNG_START):
         return not data.endswith(_PNG_END) and not _has_png_end(data)
@@ -25,7 +25,7 @@ def is_cut_short(data: bytes) -> bool:
 
 
 def _has_png_end(data: bytes) -> bool:
-    """Go from chunk to chunk: length, type, content, check sum."""
+    """Walk the chunks, each of length, type, content and check sum, up to the last one."""
     start = len(_PNG_START)
     while start + len(_PNG_END) <= len(data):
         if data[start + 4 : start + 8] == b"IEND":
@@ -35,7 +35,7 @@ def _has_png_end(data: bytes) -> bool:
 
 
 def _has_jpeg_end(data: bytes) -> bool:
-    """Go from marker to marker; what a segment holds, such as the JPEG of a thumbnail, is passed over."""
+    """Walk the markers; the content of a segment, such as the JPEG of a thumbnail, is skipped."""
     start = 2
     while (found := _JPEG_SEGMENT.search(data, start)) is not None:
         if data[found.end() - 1] == _JPEG_END:

@@ -12,6 +12,7 @@ import numpy as np
 from slamdepth.errors import ImageDecodeError, OutputError
 from slamdepth.io.image_end import is_cut_short
 from slamdepth.io.text import replacing
+from slamdepth.typing import Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,21 +53,19 @@ def read_depth_raw(path: str | Path) -> NDArray[np.uint16]:
     return raw
 
 
-def read_depth_m(
-    path: str | Path, depth_factor: float, *, unknown_raw: Sequence[int] = ()
-) -> NDArray[np.float32]:
+def read_depth_m(path: str | Path, depth_factor: float, *, unknown_raw: Sequence[int] = ()) -> Floats32:
     """Read a 16-bit depth image as ``(H, W)`` float32 metres, 0 where unknown.
 
     Args:
         path: the image.
         depth_factor: raw units per metre.
-        unknown_raw: raw values that mean unknown, beside 0.
+        unknown_raw: raw values that mean unknown, besides 0.
 
     Raises:
         ImageDecodeError: as :func:`read_depth_raw`.
     """
     raw = read_depth_raw(path)
-    depth_m = raw.astype(np.float32) / np.float32(depth_factor)
+    depth_m: Floats32 = raw.astype(np.float32) / np.float32(depth_factor)
     for value in unknown_raw:
         depth_m[raw == value] = 0.0
     return depth_m

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.errors import WeightsError
+from slamdepth.frontend.metric import hamming_nearest
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
 
 DESCRIPTOR_BYTES = 32
 _SHIPPED = "orb_vocabulary.npz"
-# 16 x 2000 words of 8 bytes stay in the second-level cache of a core.
-_BLOCK = 16
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Vocabulary:
         Raises:
             ValueError: the descriptors have another shape or type.
         """
-        return nearest(check_descriptors(descriptors), self.words)
+        return hamming_nearest(check_descriptors(descriptors), self.words)
 
     def save(self, path: str | Path) -> None:
         """Write the ``.npz`` that :func:`load_vocabulary` reads; the same bytes every time."""
@@ -97,7 +96,7 @@ def load_vocabulary(path: str | Path | None = None) -> Vocabulary:
     except Exception as error:  # numpy and zipfile raise a zoo of types for a damaged file
         raise WeightsError(
             f"{origin}: cannot read the vocabulary ({error}); reinstall slamdepth or train one with "
-            "'python -m data_scripts.train_vocabulary'"
+            "'python data_scripts/train_vocabulary.py'"
         ) from error
 
 
@@ -113,26 +112,3 @@ def check_descriptors(descriptors: Descriptors) -> Descriptors:
             f"descriptors must be (N, {DESCRIPTOR_BYTES}) uint8, got {descriptors.shape} {descriptors.dtype}"
         )
     return np.ascontiguousarray(descriptors)
-
-
-def nearest(descriptors: Descriptors, centres: Descriptors) -> NDArray[np.intp]:
-    """Index ``(N,)`` of the centre ``(K, 32)`` with the smallest Hamming distance to each descriptor.
-
-    Both uint8 and contiguous; ties go to the lowest index.
-    """
-    wide = descriptors.view(np.uint64)
-    wide_centres = np.ascontiguousarray(centres.view(np.uint64).T)
-    index = np.empty(len(wide), dtype=np.intp)
-    differing = np.empty((_BLOCK, len(centres)), dtype=np.uint64)
-    count = np.empty((_BLOCK, len(centres)), dtype=np.uint8)
-    distance = np.empty((_BLOCK, len(centres)), dtype=np.uint16)  # 256 does not fit uint8
-    for start in range(0, len(wide), _BLOCK):
-        block = wide[start : start + _BLOCK]
-        n = len(block)
-        distance[:n] = 0
-        for k in range(wide.shape[1]):
-            np.bitwise_xor(block[:, k, None], wide_centres[k], out=differing[:n])
-            np.bitwise_count(differing[:n], out=count[:n])
-            distance[:n] += count[:n]
-        index[start : start + n] = distance[:n].argmin(axis=1)
-    return index

@@ -15,9 +15,8 @@ import numpy as np
 from slamdepth import __version__
 from slamdepth.errors import ConfigError, DatasetError, OutputError, SlamdepthError
 from slamdepth.evaluation.depth_statistics import DepthStatistics
-from slamdepth.io import write_json
+from slamdepth.io import writable, write_json
 from slamdepth.pipeline.depth_data import open_depth_data, thinned
-from slamdepth.pipeline.folder import writable
 from slamdepth.report.data_stats import DataRow, write_data_page
 from slamdepth.training.data import Place
 from slamdepth.types import Camera

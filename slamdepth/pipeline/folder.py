@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 import logging.handlers
-import os
 import shlex
 import time
 from collections.abc import Iterator, Sequence
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slamdepth.errors import OutputError
-from slamdepth.io import write_text
+from slamdepth.io import writable, write_text
 
 FILES = {
     "trajectory.txt": "every placed frame after optimisation (TUM format, camera to world)",
@@ -149,38 +148,3 @@ def _is_run(path: Path) -> bool:
         return (path / _README).read_text(encoding="utf-8").startswith(_MARK)
     except (OSError, UnicodeDecodeError):
         return False
-
-
-def writable_file(path: Path, ending: str) -> Path:
-    """``path``, if a file can be written there without replacing one of another kind.
-
-    Asked before the work, so that none is lost. A file of an earlier call (same ``ending``,
-    such as ``.json``) may be replaced; one that a user mixed up with it may not.
-
-    Raises:
-        OutputError: it is a folder or another kind of file, it may not be written, or its folder is
-            missing or cannot be written.
-    """
-    path = path.expanduser()
-    if path.is_dir():
-        raise OutputError(f"{path}: is a folder; name a file for the results")
-    if path.exists() and path.suffix.lower() != ending:
-        raise OutputError(f"{path}: is there already and no {ending} file; name another file")
-    if not path.parent.exists():
-        raise OutputError(f"{path.parent}: no such folder to write to; make it first")
-    writable(path.parent)
-    if path.exists() and not os.access(path, os.W_OK):
-        raise OutputError(f"{path}: cannot be written: no permission to replace it")
-    return path
-
-
-def writable(path: Path) -> Path:
-    """``path``, if it or the nearest folder above it that exists can be written."""
-    place = path.absolute()
-    while not place.exists() and place != place.parent:
-        place = place.parent
-    if not place.is_dir():
-        raise OutputError(f"{path}: cannot be written: {place} is a file")
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise OutputError(f"{path}: cannot be written: no permission to write to {place}")
-    return path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From settings to a depth head and a folder that explains it."""
+"""Training of a depth head from settings, with a report folder."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ if TYPE_CHECKING:
 
 
 def report_folder(output: Path) -> Path:
-    """Where the pictures and figures of the head ``output`` go."""
+    """The folder of plots and figures for the head file ``output``."""
     return output.with_name(f"{output.stem}_training")
 
 
 def run_training(
     config: TrainConfig, *, device: str = "cpu", progress: Progress = silent, backbone: DinoV2 | None = None
 ) -> TrainResult:
-    """Train the head of ``config`` and write :func:`report_folder` beside it.
+    """Train the head of ``config`` and write its report to :func:`report_folder`.
 
-    Arguments and errors are those of :func:`slamdepth.training.loop.train_depth`.
+    Places may be of every layout in ``slamdepth.datasets``. For arguments and errors see
+    :func:`slamdepth.training.loop.train_depth`.
     """
     from slamdepth.report.training import write_training_report
     from slamdepth.training.loop import train_depth
@@ -44,7 +45,7 @@ def run_training(
 
 
 def plan_run(config: TrainConfig, *, device: str = "cpu", backbone: DinoV2 | None = None) -> TrainingPlan:
-    """What :func:`run_training` would take; errors of :func:`slamdepth.training.plan.plan_training`."""
+    """Estimate the cost of :func:`run_training`; see :func:`slamdepth.training.plan.plan_training`."""
     from slamdepth.training.plan import plan_training
 
     return plan_training(config, device=device, backbone=backbone, readers=sequence_readers())
@@ -58,7 +59,7 @@ def run_search(
     progress: Progress = silent,
     backbone: DinoV2 | None = None,
 ) -> SearchResult:
-    """Tune ``config``; see :func:`slamdepth.training.search.search_settings`."""
+    """Search the settings of ``config``; see :func:`slamdepth.training.search.search_settings`."""
     from slamdepth.training.search import search_settings
 
     return search_settings(

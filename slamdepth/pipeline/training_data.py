@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sequences as places to train on: every layout of ``slamdepth.datasets``, by its name.
+"""Sequences as places to train on: every layout of ``slamdepth.datasets``, under its name.
 
-The rooms ``depth`` and ``datasets`` don't know one another; here they meet.
+The packages ``training`` and ``datasets`` do not import one another; this module connects them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,12 +17,10 @@ from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
 from slamdepth.synth.sequence import SETTINGS_FILE
 from slamdepth.training.data import PlaceReader, fingerprint
 from slamdepth.types import Camera, Frame
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from slamdepth.typing import Floats
 
 _BENCHMARKS = {"tum": "sequences in the TUM RGB-D layout", "7scenes": "7-Scenes sequences"}
-"""What a head trained on a layout has seen; a recording of one's own in it counts too."""
+"""The benchmark that a head trained on a layout has seen. Own recordings in that layout count too."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +28,9 @@ class SequencePlace:
     """The frames of a sequence that have sensor depth, in raw (distorted) pixels.
 
     Attributes:
-        frames: their indices in ``dataset``.
+        dataset: the sequence.
+        frames: indices of these frames in ``dataset``.
+        benchmark: the benchmark it belongs to, or None.
     """
 
     dataset: Dataset
@@ -40,7 +39,7 @@ class SequencePlace:
 
     @classmethod
     def of(cls, dataset: Dataset, benchmark: str | None = None) -> SequencePlace:
-        """The frames of ``dataset`` whose image and depth are there; files are not opened.
+        """The frames of ``dataset`` that have an image and depth; files are not opened.
 
         Raises:
             DatasetError: there are none.
@@ -81,7 +80,7 @@ class SequencePlace:
         return fingerprint((), str(self.dataset.path), times, self.camera, self.frames)
 
     def read(self, index: int) -> Frame:
-        """Frame ``index`` of those with depth; see :meth:`slamdepth.training.data.Place.read`."""
+        """Frame ``index`` among those with depth; see :meth:`slamdepth.training.data.Place.read`."""
         try:
             frame = self.dataset.read(self.frames[index], with_depth=True)
         except (ImageDecodeError, CameraError) as error:
@@ -90,15 +89,15 @@ class SequencePlace:
             raise DatasetError(f"{self.dataset.path}: frame {self.frames[index]} has no depth")
         return replace(frame, index=index)
 
-    def down(self, index: int) -> NDArray[np.float64] | None:
-        """Unknown: nothing here says it."""
+    def gravity(self, index: int) -> Floats | None:
+        """None: sequences do not record gravity."""
         del index
         return None
 
 
 @dataclass(frozen=True)
 class SequenceReader:
-    """A reader of sequences as a reader of places."""
+    """Adapts a reader of sequences to a reader of places."""
 
     reader: Reader
 
@@ -119,7 +118,7 @@ class SequenceReader:
 
 @dataclass(frozen=True)
 class SynthReader(SequenceReader):
-    """Opens what ``slamdepth synth`` renders: the TUM layout, but nothing of TUM's."""
+    """Opens sequences rendered by ``slamdepth synth``: in TUM layout, but not of the TUM benchmark."""
 
     @property
     def name(self) -> str:
@@ -139,7 +138,7 @@ class SynthReader(SequenceReader):
 
 
 def sequence_readers() -> dict[str, PlaceReader]:
-    """Every sequence layout, and ``synth`` before the layout it is written in."""
+    """Readers of every sequence layout; ``synth`` comes before ``tum``, whose layout it shares."""
     layouts = {reader.name: reader for reader in known_readers()}
     readers: dict[str, PlaceReader] = {"synth": SynthReader(layouts["tum"])}
     readers.update({name: SequenceReader(reader) for name, reader in layouts.items()})

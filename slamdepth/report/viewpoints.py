@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth.geometry import look_at
 from slamdepth.report.axes import level_axes
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
@@ -95,17 +96,6 @@ def over_the_shoulder(mesh: Mesh, T_world_camera: Floats, down_w: Floats, camera
         if shown > most:
             best, most = T, shown
     return best
-
-
-def look_at(eye_w: Floats, target_w: Floats, down_w: Floats) -> Floats:
-    """``T_world_camera (4, 4)`` of a camera at ``eye_w`` that has ``target_w`` in its middle."""
-    T = np.eye(4)
-    ahead = (target_w - eye_w) / np.linalg.norm(target_w - eye_w)
-    right = np.cross(down_w, ahead)
-    right /= np.linalg.norm(right)
-    T[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
-    T[:3, 3] = eye_w
-    return T
 
 
 def _triangles(mesh: Mesh) -> tuple[Floats, Floats]:

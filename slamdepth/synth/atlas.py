@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All textures of the synthetic room, lit, in one image with its smaller copies (mip levels)."""
+"""All lit textures of the synthetic room in one image with its mip levels."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.synth.shapes import Surface
+from slamdepth.typing import Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,7 +23,7 @@ _EXPOSURE = 1.15
 
 @dataclass(frozen=True)
 class Place:
-    """Where a surface's texture lies at level 0, gutter excluded, in texels."""
+    """The rectangle of a surface's texture at level 0 without gutter, in texels."""
 
     x: int
     y: int
@@ -32,21 +33,19 @@ class Place:
 
 @dataclass(frozen=True)
 class Atlas:
-    """The levels side by side in one image.
+    """A texture atlas with all mip levels in one image.
 
     Attributes:
         image_rgb: ``(H, W, 3)`` uint8.
         offsets: ``(LEVELS, 2)`` x and y of each level's corner in ``image_rgb``.
-        places: of each surface, at level 0.
+        places: rectangle of each surface at level 0.
     """
 
     image_rgb: NDArray[np.uint8]
-    offsets: NDArray[np.float32]
+    offsets: Floats32
     places: list[Place]
 
-    def sample(
-        self, x: NDArray[np.float32], y: NDArray[np.float32], level: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def sample(self, x: Floats32, y: Floats32, level: Floats32) -> Floats32:
         """Trilinear colours ``(N, 3)`` at level 0 texels ``x, y (N,)`` and fractional levels ``(N,)``."""
         level = np.clip(level, 0.0, LEVELS - 1.0)
         lower = np.minimum(level.astype(np.int32), LEVELS - 2)
@@ -58,9 +57,7 @@ class Atlas:
         coarse += fine
         return coarse
 
-    def _bilinear(
-        self, x: NDArray[np.float32], y: NDArray[np.float32], level: NDArray[np.int32]
-    ) -> NDArray[np.float32]:
+    def _bilinear(self, x: Floats32, y: Floats32, level: NDArray[np.int32]) -> Floats32:
         import cv2
 
         count = len(x)
@@ -75,9 +72,7 @@ class Atlas:
         return out.reshape(-1, 3)[:count].astype(np.float32)
 
 
-def build_atlas(
-    surfaces: Sequence[Surface], light: Sequence[NDArray[np.float32]], texel_m: float, seed: int
-) -> Atlas:
+def build_atlas(surfaces: Sequence[Surface], light: Sequence[Floats32], texel_m: float, seed: int) -> Atlas:
     """Paint, light and pack every surface.
 
     Args:
@@ -126,11 +121,12 @@ def build_atlas(
     return Atlas(image, offsets, places)
 
 
-def _developed(albedo_srgb: NDArray[np.float32], irradiance: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Albedo under light, exposed and compressed as a camera does, in sRGB 0 to 1."""
+def _developed(albedo_srgb: Floats32, irradiance: Floats32) -> Floats32:
+    """sRGB values 0 to 1 of albedo under light, after exposure and tone mapping as in a camera."""
     linear = np.power(np.clip(albedo_srgb, 0, 1), np.float32(2.2)) * irradiance * np.float32(_EXPOSURE)
     compressed = linear * (1 + linear / np.float32(4.0)) / (1 + linear)  # Reinhard, white at 2
-    return np.power(np.clip(compressed * np.float32(1.25), 0, 1), np.float32(1 / 2.2)).astype(np.float32)
+    developed: Floats32 = np.power(np.clip(compressed * np.float32(1.25), 0, 1), np.float32(1 / 2.2))
+    return developed.astype(np.float32)
 
 
 def _pack(sizes: Sequence[tuple[int, int]]) -> tuple[list[Place], int]:

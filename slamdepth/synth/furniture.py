@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The furniture of the synthetic room; see :mod:`slamdepth.synth.scene` for its walls."""
+"""Furniture of the synthetic room; its walls are in :mod:`slamdepth.synth.scene`."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamdepth.synth import paint as paint
-from slamdepth.synth import prints as printed
+from slamdepth.synth import paint, prints
 from slamdepth.synth.shapes import Surface, box, cylinder, ellipsoid, lathe, leaf, quad
 
 
 def tinted(rng: np.random.Generator, colour: paint.Colour, spread: float = 0.06) -> paint.Colour:
-    """A colour near ``colour``."""
+    """A random colour near ``colour``."""
     r, g, b = np.clip(np.array(colour) + rng.uniform(-spread, spread, 3), 0.02, 0.95)
     return (float(r), float(g), float(b))
 
 
 def desk(rng: np.random.Generator) -> list[Surface]:
-    """A desk by the north wall, with a screen, papers, books, a lamp, and a stool before it."""
+    """A desk by the north wall with a screen, papers, books and a lamp, and a stool in front of it."""
     top, leg = paint.wood(tinted(rng, (0.66, 0.50, 0.34))), paint.plain((0.22, 0.22, 0.24), contrast=0.08)
     out = box((0.95, 3.28, 0.70), (1.70, 0.70, 0.035), top, bottom=True)
     for x in (1.0, 2.54):
@@ -37,7 +36,7 @@ def desk(rng: np.random.Generator) -> list[Surface]:
     dark = paint.plain((0.08, 0.08, 0.09), contrast=0.05)
     out += box((1.45, 3.78, 0.86), (0.62, 0.035, 0.38), dark, bottom=True)
     out.append(
-        replace(quad((1.462, 3.779, 1.228), (0.596, 0, 0), (0, 0, -0.356), printed.screen()), emission=0.8)
+        replace(quad((1.462, 3.779, 1.228), (0.596, 0, 0), (0, 0, -0.356), prints.screen()), emission=0.8)
     )
     out += box((1.72, 3.79, 0.735), (0.08, 0.03, 0.20), dark) + box(
         (1.64, 3.70, 0.735), (0.24, 0.18, 0.012), dark
@@ -45,19 +44,19 @@ def desk(rng: np.random.Generator) -> list[Surface]:
     out += box(
         (1.52, 3.42, 0.735),
         (0.44, 0.14, 0.018),
-        {"+z": printed.keyboard(), "*": dark},
+        {"+z": prints.keyboard(), "*": dark},
         yaw=rng.uniform(-0.1, 0.1),
     )
     out += box(
         (2.10, 3.38, 0.735),
         (0.21, 0.30, 0.004),
-        {"+z": printed.page(), "*": paint.plain((0.9, 0.9, 0.88))},
+        {"+z": prints.page(), "*": paint.plain((0.9, 0.9, 0.88))},
         yaw=rng.uniform(-0.5, 0.5),
     )
     out += box(
         (1.08, 3.40, 0.735),
         (0.21, 0.30, 0.006),
-        {"+z": printed.page(), "*": paint.plain((0.9, 0.9, 0.88))},
+        {"+z": prints.page(), "*": paint.plain((0.9, 0.9, 0.88))},
         yaw=rng.uniform(0.1, 0.6),
     )
     out += cylinder(
@@ -71,7 +70,7 @@ def desk(rng: np.random.Generator) -> list[Surface]:
     for _ in range(4):
         colour, thick = tinted(rng, (0.45, 0.38, 0.36), 0.3), float(rng.uniform(0.02, 0.045))
         cover = {
-            "+z": printed.poster(),
+            "+z": prints.poster(),
             "-y": paint.wood(colour),
             "*": paint.plain((0.86, 0.83, 0.74), contrast=0.1),
         }
@@ -128,9 +127,9 @@ def bookshelf(rng: np.random.Generator) -> list[Surface]:
                 x += 0.18
                 continue
             tall = float(rng.uniform(0.20, 0.31))
-            colour = tinted(rng, printed.pick_ink(rng), 0.08)
+            colour = tinted(rng, prints.pick_ink(rng), 0.08)
             cover = {
-                "-y": printed.book(colour),
+                "-y": prints.book(colour),
                 "+z": paint.plain((0.85, 0.82, 0.74), contrast=0.1),
                 "*": paint.plain(colour),
             }
@@ -168,7 +167,7 @@ def cabinet(rng: np.random.Generator) -> list[Surface]:
         (1.95, 0.10, 0.62), (0.3, 0.12, 0.08), dark
     )
     out.append(
-        replace(quad((2.585, 0.181, 1.265), (-0.95, 0, 0), (0, 0, -0.55), printed.landscape()), emission=0.7)
+        replace(quad((2.585, 0.181, 1.265), (-0.95, 0, 0), (0, 0, -0.55), prints.landscape()), emission=0.7)
     )
     out.append(
         lathe(
@@ -177,12 +176,12 @@ def cabinet(rng: np.random.Generator) -> list[Surface]:
             paint.checker((0.25, 0.40, 0.55), (0.85, 0.84, 0.8), 0.03),
         )
     )
-    out += box((2.66, 0.10, 0.62), (0.18, 0.2, 0.26), {"+y": printed.poster(), "*": dark}, yaw=0.2)
+    out += box((2.66, 0.10, 0.62), (0.18, 0.2, 0.26), {"+y": prints.poster(), "*": dark}, yaw=0.2)
     return out
 
 
 def rug_and_table(rng: np.random.Generator) -> list[Surface]:
-    """Rug, low table and what lies on it."""
+    """A rug, and a low table with things on it."""
     colours = [
         tinted(rng, c)
         for c in ((0.60, 0.18, 0.16), (0.22, 0.26, 0.38), (0.80, 0.70, 0.52), (0.30, 0.35, 0.28))
@@ -202,7 +201,7 @@ def rug_and_table(rng: np.random.Generator) -> list[Surface]:
         out += box(
             (x, y, 0.415 + 0.012 * (yaw < 0)),
             (0.20, 0.28, 0.012),
-            {"+z": printed.poster(), "*": paint.plain((0.85, 0.85, 0.82))},
+            {"+z": prints.poster(), "*": paint.plain((0.85, 0.85, 0.82))},
             yaw=yaw,
         )
     bowl = paint.checker((0.85, 0.83, 0.78), (0.30, 0.42, 0.50), 0.025)
@@ -248,7 +247,7 @@ def plant(rng: np.random.Generator) -> list[Surface]:
 
 def corners(rng: np.random.Generator) -> list[Surface]:
     """Cartons in one corner, a floor lamp in another, a stool under the window."""
-    card = printed.cardboard()
+    card = prints.cardboard()
     out = box((0.12, 0.12, 0.0), (0.55, 0.42, 0.38), card, yaw=0.08) + box(
         (0.16, 0.14, 0.38), (0.42, 0.34, 0.28), card, yaw=-0.2
     )

@@ -1,22 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Light baked into the texture atlas: area lamps with shadows, and occluded ambient light."""
+"""Light baked into the texture atlas: area lamps with shadows, and ambient light with occlusion."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from slamdepth.synth.scene import Lamp
 from slamdepth.synth.shapes import Surface
-from slamdepth.typing import Floats
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+from slamdepth.typing import Bools, Floats, Floats32
 
 SPACING_M = 0.04
-"""Least distance of the points the light is computed at."""
+"""Smallest spacing of the points at which light is computed."""
 
 _AMBIENT = np.array([0.62, 0.60, 0.57])
 _AMBIENT_REACH_M = 0.9
@@ -25,7 +21,7 @@ _AMBIENT_SAMPLES = 24
 
 
 def surface_samples(surface: Surface, spacing_m: float) -> tuple[Floats, Floats]:
-    """Points and normals ``(rows, columns, 3)`` spread evenly over a surface's texture."""
+    """Points and normals ``(rows, columns, 3)`` evenly spaced over a surface's texture."""
     import cv2
 
     along, down = surface.size_m
@@ -48,7 +44,7 @@ def surface_samples(surface: Surface, spacing_m: float) -> tuple[Floats, Floats]
 
 def bake(
     raycaster: Any, surfaces: list[Surface], lamps: list[Lamp], texel_m: float, seed: int
-) -> list[NDArray[np.float32]]:
+) -> list[Floats32]:
     """Irradiance maps ``(rows, columns, 3)`` of all surfaces, in arbitrary linear units.
 
     Args:
@@ -92,9 +88,9 @@ def _direct(raycaster: Any, points: Floats, normals: Floats, lamp: Lamp, rng: np
         cosine = np.sum(normals * ray, axis=1) / np.sqrt(distance2)
         lit = np.flatnonzero(cosine > 0)
         shadowed = occluded(raycaster, points[lit], ray[lit], 0.96)
-        # Softened near the lamp, so that a shade does not burn out its own wall.
+        # Softened near the lamp, so that a shade does not overexpose its own wall.
         total[lit] += np.where(shadowed, 0.0, cosine[lit] / (0.35 + distance2[lit]))
-    return total[:, None] / _LAMP_SAMPLES * np.array(lamp.power)
+    return np.asarray(total[:, None] / _LAMP_SAMPLES * np.array(lamp.power))
 
 
 def _ambient(raycaster: Any, points: Floats, normals: Floats, rng: np.random.Generator) -> Floats:
@@ -107,24 +103,24 @@ def _ambient(raycaster: Any, points: Floats, normals: Floats, rng: np.random.Gen
         ray *= _AMBIENT_REACH_M / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-6)
         hit = cast_distance(raycaster, points, ray)
         open_ += np.minimum(hit, 1.0) ** 0.6
-    return (0.30 + 0.70 * open_ / _AMBIENT_SAMPLES)[:, None] * _AMBIENT
+    return np.asarray((0.30 + 0.70 * open_ / _AMBIENT_SAMPLES)[:, None] * _AMBIENT)
 
 
-def occluded(raycaster: Any, origins: Floats, rays: Floats, farthest: float) -> NDArray[np.bool_]:
+def occluded(raycaster: Any, origins: Floats, rays: Floats, farthest: float) -> Bools:
     """Whether something lies between ``origins (N, 3)`` and ``origins + farthest * rays``."""
     from slamdepth.open3d_loader import import_open3d
 
     o3d = import_open3d()
     packed = o3d.core.Tensor(np.concatenate([origins, rays], axis=1).astype(np.float32))
-    result: NDArray[np.bool_] = raycaster.test_occlusions(packed, tnear=0.0, tfar=farthest).numpy()
+    result: Bools = raycaster.test_occlusions(packed, tnear=0.0, tfar=farthest).numpy()
     return result
 
 
-def cast_distance(raycaster: Any, origins: Floats, rays: Floats) -> NDArray[np.float32]:
+def cast_distance(raycaster: Any, origins: Floats, rays: Floats) -> Floats32:
     """Distances ``(N,)`` to the first hit, in lengths of the rays."""
     from slamdepth.open3d_loader import import_open3d
 
     o3d = import_open3d()
     packed = o3d.core.Tensor(np.concatenate([origins, rays], axis=1).astype(np.float32))
-    distance: NDArray[np.float32] = raycaster.cast_rays(packed)["t_hit"].numpy()
+    distance: Floats32 = raycaster.cast_rays(packed)["t_hit"].numpy()
     return distance

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Procedural textures of the synthetic room, with detail at several scales.
 
-Each function returns a :data:`~slamdepth.synth.shapes.Paint`. Lengths are in
-metres, colours sRGB 0 to 1; detail is laid out in metres, so that a coarser atlas shows
-the same pattern.
+Most functions return a :data:`~slamdepth.synth.shapes.Paint`. Lengths are in metres, colours sRGB 0 to 1.
+Detail is laid out in metres, so a coarser atlas shows the same pattern.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ def fractal(
         weight = gain**octave
         total += weight * cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
         power += weight * weight * 0.45
-    return total / np.float32(np.sqrt(power))
+    return np.asarray(total / np.float32(np.sqrt(power)))
 
 
 def flat(height: int, width: int, colour: Colour) -> Floats32:
@@ -63,7 +62,7 @@ def fill(image: Floats32, x0: float, y0: float, x1: float, y1: float, colour: Co
 
 
 def plain(colour: Colour, *, contrast: float = 0.03, largest_m: float = 0.4) -> Paint:
-    """Painted or moulded matter with faint mottling."""
+    """A painted or moulded surface with faint mottling."""
 
     def paint(rng: np.random.Generator, height: int, width: int, texel_m: float) -> Floats32:
         noise = fractal(rng, height, width, texel_m, largest_m=largest_m)
@@ -73,12 +72,12 @@ def plain(colour: Colour, *, contrast: float = 0.03, largest_m: float = 0.4) -> 
 
 
 def muted(paint_: Paint, contrast: float) -> Paint:
-    """Another paint with its contrast about its mean colour reduced."""
+    """``paint_`` with its contrast about the mean colour scaled by ``contrast``."""
 
     def paint(rng: np.random.Generator, height: int, width: int, texel_m: float) -> Floats32:
         full = paint_(rng, height, width, texel_m)
         mean = full.mean(axis=(0, 1), keepdims=True)
-        return (mean + contrast * (full - mean)).astype(np.float32)
+        return np.asarray(mean + contrast * (full - mean), np.float32)
 
     return paint
 
@@ -103,7 +102,7 @@ def plaster(colour: Colour) -> Paint:
 
 
 def wallpaper(ground: Colour, figure: Colour) -> Paint:
-    """Stripes and irregular sprigs, each a little different from the next."""
+    """Stripes and irregular sprigs, each slightly different."""
 
     def paint(rng: np.random.Generator, height: int, width: int, texel_m: float) -> Floats32:
         import cv2
@@ -132,7 +131,7 @@ def wallpaper(ground: Colour, figure: Colour) -> Paint:
 
 
 def brick(colour: Colour = (0.62, 0.36, 0.28), mortar: Colour = (0.72, 0.69, 0.65)) -> Paint:
-    """Courses of bricks, every one of its own shade."""
+    """Courses of bricks, each of its own shade."""
 
     def paint(rng: np.random.Generator, height: int, width: int, texel_m: float) -> Floats32:
         image = shaded(
@@ -225,7 +224,7 @@ def rug(colours: list[Colour]) -> Paint:
 
 
 def checker(first: Colour, second: Colour, size_m: float) -> Paint:
-    """A checkerboard, every field of a slightly different shade."""
+    """A checkerboard with fields of slightly different shades."""
 
     def paint(rng: np.random.Generator, height: int, width: int, texel_m: float) -> Floats32:
         row = (np.arange(height) * texel_m / size_m).astype(int)[:, None]

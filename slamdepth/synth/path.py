@@ -8,7 +8,7 @@ import numpy as np
 from slamdepth.typing import Floats
 
 SPEED_M_S = 0.3
-"""Mean speed the path is laid out for, as of a walking hand."""
+"""Mean speed of the camera, that of a walking person."""
 
 _CENTRE_M = np.array([2.5, 2.0, 1.45])
 _REACH_M = np.array([0.95, 0.75])
@@ -18,9 +18,9 @@ _LONG_LAP_S = 16.0
 def path_poses(phase: Floats, duration_s: float, seed: int) -> Floats:
     """Poses ``T_world_camera (N, 4, 4)`` at ``phase (N,)``, 0 to 1 along the closed path.
 
-    Phases 0 and 1 are the same viewpoint. A path of at least 16 s turns once about
-    the room (more laps when longer); a shorter one sweeps to one side and comes back by
-    another way, so that the camera never turns faster than a hand does. The world is z up.
+    Phases 0 and 1 are the same viewpoint. A path of at least 16 s makes one or more full laps around the
+    room. A shorter one sweeps to one side and returns another way, so that the camera never rotates faster
+    than a hand-held one. The world is z up.
 
     Args:
         phase: where along the path.
@@ -38,7 +38,7 @@ def path_poses(phase: Floats, duration_s: float, seed: int) -> Floats:
     turn = laps * angle + start
 
     position = np.empty((len(phase), 3))
-    # On the far side of the centre from what is looked at: across the room.
+    # On the far side of the centre, looking across the room.
     position[:, 0] = _CENTRE_M[0] - radius[0] * np.cos(turn)
     position[:, 1] = _CENTRE_M[1] - radius[1] * np.sin(turn)
     small = min(1.0, duration_s / 9.0)  # short paths move less, not faster

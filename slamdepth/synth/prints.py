@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Printed and pictured things of the synthetic room: posters, books, screens, a window."""
+"""Procedural prints of the synthetic room: posters, books, screens, a view for the window."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def write(
     ink: Colour,
     line_m: float,
 ) -> None:
-    """Draw lines of made-up words into ``area`` (x0, y0, x1, y1 texels) of ``image``."""
+    """Draw lines of random words into ``area`` (x0, y0, x1, y1 in texels) of ``image``, in place."""
     x0, y0, x1, y1 = area
     if paper is not None:
         fill(image, x0, y0, x1, y1, paper)
@@ -136,7 +136,7 @@ def poster() -> Paint:
 
 
 def landscape() -> Paint:
-    """A picture of hills under a cloudy sky."""
+    """Hills under a cloudy sky."""
 
     def paint(rng: np.random.Generator, height: int, width: int, texel_m: float) -> Floats32:
         scale = texel_m / max(height * texel_m, 1e-3)
@@ -205,7 +205,7 @@ def screen() -> Paint:
     """A desktop with windows of code and a bar."""
 
     def paint(rng: np.random.Generator, height: int, width: int, texel_m: float) -> Floats32:
-        image = landscape()(rng, height, width, texel_m) * np.float32(0.6)
+        image: Floats32 = landscape()(rng, height, width, texel_m) * np.float32(0.6)
         for x0, y0, x1, y1, paper, ink in (
             (0.04, 0.07, 0.50, 0.86, (0.11, 0.13, 0.17), (0.55, 0.75, 0.60)),
             (0.44, 0.20, 0.95, 0.92, (0.92, 0.93, 0.94), (0.15, 0.20, 0.35)),
@@ -247,7 +247,7 @@ def keyboard() -> Paint:
 
 
 def clock() -> Paint:
-    """A dial; to be wound about a lid, so rows run from the middle out."""
+    """A clock face in polar coordinates for the lid of a cylinder: rows run from the centre outwards."""
 
     def paint(rng: np.random.Generator, height: int, width: int, texel_m: float) -> Floats32:
         image = flat(height, width, (0.93, 0.92, 0.88))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs of the synthetic room: rays from Open3D, colours from the lit atlas."""
+"""Rendering of the synthetic room: rays by Open3D, colours from the lit atlas."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from slamdepth.synth.light import bake
 from slamdepth.synth.scene import Scene
 from slamdepth.synth.shapes import Surface
 from slamdepth.types import Camera
-from slamdepth.typing import Floats
+from slamdepth.typing import Bools, Floats, Floats32, Ints
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,7 +31,7 @@ class Renderer:
     trilinear texture samples inside a surface, nine rays across a silhouette.
 
     Args:
-        scene: what to render; light is baked once here (seconds).
+        scene: what to render; its light is baked on construction, which takes seconds.
         camera: an undistorted camera.
         texel_m: size of a texel.
         seed: seed of paint and light sampling.
@@ -57,12 +57,12 @@ class Renderer:
         self._x = ((u.ravel() - camera.cx) / camera.fx).astype(np.float32)
         self._y = ((v.ravel() - camera.cy) / camera.fy).astype(np.float32)
 
-    def depth(self, T_world_camera: Floats) -> NDArray[np.float32]:
+    def depth(self, T_world_camera: Floats) -> Floats32:
         """Depth along z ``(H, W)`` in metres."""
         depth, _ = self._cast(T_world_camera, self._x, self._y)
         return depth.reshape(self._camera.height, self._camera.width)
 
-    def render(self, T_world_camera: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def render(self, T_world_camera: Floats) -> tuple[Floats32, Floats32]:
         """Colours ``(H, W, 3)`` sRGB 0 to 255 and depth along z ``(H, W)`` in metres."""
         height, width = self._camera.height, self._camera.width
         depth, triangle = self._cast(T_world_camera, self._x, self._y)
@@ -80,9 +80,7 @@ class Renderer:
             colour[edge] = fine.reshape(len(edge), -1, 3).mean(axis=1)
         return colour.reshape(height, width, 3), depth.reshape(height, width)
 
-    def _cast(
-        self, T_world_camera: Floats, x: NDArray[np.float32], y: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    def _cast(self, T_world_camera: Floats, x: Floats32, y: Floats32) -> tuple[Floats32, Ints]:
         """Depth and triangle of the rays through normalised image points ``(N,)``."""
         o3d = import_open3d()
         R = T_world_camera[:3, :3].astype(np.float32)
@@ -94,7 +92,7 @@ class Renderer:
         triangle = np.minimum(hits["primitive_ids"].numpy(), len(self._corners) - 1).astype(np.int64)
         return hits["t_hit"].numpy(), triangle
 
-    def _texel_maps(self, T_world_camera: Floats) -> NDArray[np.float32]:
+    def _texel_maps(self, T_world_camera: Floats) -> Floats32:
         """Homographies ``(T, 9)`` from normalised image points to texels (relative to the corner 0).
 
         With the corners Q as columns of M, a ray d meets the triangle's plane at
@@ -115,13 +113,13 @@ class Renderer:
 
     def _colour(
         self,
-        to_texel: NDArray[np.float32],
-        triangle: NDArray[np.int64],
-        x: NDArray[np.float32],
-        y: NDArray[np.float32],
-        taps: NDArray[np.float32],
+        to_texel: Floats32,
+        triangle: Ints,
+        x: Floats32,
+        y: Floats32,
+        taps: Floats32,
         footprint: float,
-    ) -> NDArray[np.float32]:
+    ) -> Floats32:
         """Colours ``(N, 3)``; ``taps`` in pixels, each averaging ``footprint`` of a pixel's side."""
         h = np.ascontiguousarray(to_texel[triangle].T)
         scale = 1.0 / (h[6] * x + h[7] * y + h[8])
@@ -138,7 +136,7 @@ class Renderer:
         total = np.zeros((len(x), 3), np.float32)
         for ox, oy in taps:
             total += self._atlas.sample(u + ox * du_dx + oy * du_dy, v + ox * dv_dx + oy * dv_dy, level)
-        return total / np.float32(len(taps))
+        return np.asarray(total / np.float32(len(taps)))
 
 
 def _texels(surface: Surface, place: Place) -> Floats:
@@ -164,8 +162,8 @@ def _raycaster(surfaces: list[Surface]) -> Any:
     return scene
 
 
-def _silhouettes(surface: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Pixels of which a direct neighbour shows another surface."""
+def _silhouettes(surface: NDArray[np.int32]) -> Bools:
+    """True at pixels with a direct neighbour on another surface."""
     edge = np.zeros(surface.shape, bool)
     across, down = surface[:, 1:] != surface[:, :-1], surface[1:] != surface[:-1]
     edge[:, 1:] |= across

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The furnished room: 5 x 4 x 2.6 m, z up, a corner of the floor at the origin."""
+"""The furnished room: 5 x 4 x 2.6 m, z up, with a corner of the floor at the origin."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slamdepth.synth import furniture as furniture
-from slamdepth.synth import paint as paint
-from slamdepth.synth import prints as printed
+from slamdepth.synth import furniture, paint, prints
 from slamdepth.synth.furniture import tinted
 from slamdepth.synth.shapes import Paint, Surface, box, lathe, quad
 
@@ -18,7 +16,12 @@ ROOM_M = (5.0, 4.0, 2.6)
 
 @dataclass(frozen=True)
 class Lamp:
-    """A glowing rectangle or ball: ``centre + a * edge_a + b * edge_b`` for a, b in -1..1."""
+    """A rectangular lamp: the points ``centre + a * edge_a + b * edge_b`` for a, b in -1 to 1.
+
+    Attributes:
+        centre, edge_a, edge_b: metres.
+        power: red, green and blue, in arbitrary linear units.
+    """
 
     centre: tuple[float, float, float]
     edge_a: tuple[float, float, float]
@@ -28,28 +31,31 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Scene:
+    """Surfaces in metres (z up) and the lamps that light them."""
+
     surfaces: list[Surface]
     lamps: list[Lamp]
 
 
 def build_scene(seed: int, texture: str) -> Scene:
-    """Lay out the room; ``seed`` varies colours, books, pictures and small placements.
+    """Build the room.
 
     Args:
-        texture: ``"rich"``; ``"low"``, where all contrast is faint; ``"bare"``, a white
-            model of the large furniture, where only light and shape are to be seen.
+        seed: varies colours, books, prints and small placements.
+        texture: ``"rich"``; ``"low"``, with faint contrast; ``"bare"``, a white model of the large
+            furniture, which shows light and shape only.
     """
     rng = np.random.default_rng([seed, 2])
     surfaces = [
-        *_shell(rng), *_window(), *_door(), *furniture.desk(rng), *furniture.bookshelf(rng),
+        *shell(rng), *window(), *door(), *furniture.desk(rng), *furniture.bookshelf(rng),
         *furniture.sofa(rng), *furniture.cabinet(rng), *furniture.rug_and_table(rng),
-        *furniture.plant(rng), *furniture.corners(rng), *_pictures(rng),
+        *furniture.plant(rng), *furniture.corners(rng), *framed_prints(rng),
     ]  # fmt: skip
     if texture == "low":
         surfaces = [replace(s, paint=paint.muted(s.paint, 0.15)) if s.emission == 0 else s for s in surfaces]
     if texture == "bare":
         surfaces = [
-            *_shell(rng), *_window(), *_door(), *furniture.desk(rng), *furniture.sofa(rng),
+            *shell(rng), *window(), *door(), *furniture.desk(rng), *furniture.sofa(rng),
             *furniture.cabinet(rng), *furniture.rug_and_table(rng), *furniture.corners(rng),
         ]  # fmt: skip
         white = paint.plain((0.8, 0.8, 0.8), contrast=0.0)
@@ -67,7 +73,8 @@ def _toned(rng: np.random.Generator, colour: paint.Colour) -> paint.Colour:
     return (float(r), float(g), float(b))
 
 
-def _shell(rng: np.random.Generator) -> list[Surface]:
+def shell(rng: np.random.Generator) -> list[Surface]:
+    """Floor, ceiling, walls (north, south, east, west), skirting boards and the ceiling lamp."""
     x, y, z = ROOM_M
     plank = paint.wood(tinted(rng, (0.56, 0.40, 0.26)), plank_m=0.12)
     cream = tinted(rng, (0.80, 0.76, 0.68), 0.03)
@@ -97,11 +104,11 @@ def _shell(rng: np.random.Generator) -> list[Surface]:
     return surfaces
 
 
-def _window() -> list[Surface]:
+def window() -> list[Surface]:
     """A bright window in the east wall, with sill, bars, curtains and a radiator."""
     white, y0, y1, z0, z1 = paint.plain((0.90, 0.90, 0.88)), 1.3, 2.7, 0.95, 2.15
     out = [
-        replace(quad((4.985, y1, z1), (0, y0 - y1, 0), (0, 0, z0 - z1), printed.landscape()), emission=1.35)
+        replace(quad((4.985, y1, z1), (0, y0 - y1, 0), (0, 0, z0 - z1), prints.landscape()), emission=1.35)
     ]
     for y in (y0 - 0.05, (y0 + y1) / 2 - 0.025, y1):
         out += box((4.95, y, z0 - 0.05), (0.05, 0.05, z1 - z0 + 0.10), white, bottom=True)
@@ -131,9 +138,9 @@ def _window() -> list[Surface]:
     return out
 
 
-def _door() -> list[Surface]:
+def door() -> list[Surface]:
     """A panelled door in the south wall."""
-    frame, leaf_ = paint.plain((0.84, 0.83, 0.79)), printed.door_leaf((0.62, 0.47, 0.33))
+    frame, leaf_ = paint.plain((0.84, 0.83, 0.79)), prints.door_leaf((0.62, 0.47, 0.33))
     out = box((3.65, 0.0, 0.0), (0.08, 0.05, 2.08), frame) + box((4.53, 0.0, 0.0), (0.08, 0.05, 2.08), frame)
     out += box((3.65, 0.0, 2.05), (0.96, 0.05, 0.08), frame, bottom=True)
     out += box((3.73, 0.0, 0.0), (0.80, 0.025, 2.05), {"+y": leaf_, "*": frame})
@@ -144,30 +151,31 @@ def _door() -> list[Surface]:
     return out
 
 
-def _pictures(rng: np.random.Generator) -> list[Surface]:
-    """Framed prints: wall, place along it, height of the lower edge, width, height."""
+def framed_prints(rng: np.random.Generator) -> list[Surface]:
+    """Framed prints and a clock on the walls."""
     out = []
+    # wall, place along it, height of the lower edge, width, height
     for wall, a, z, w, h, print_ in (
-        ("N", 0.25, 1.15, 0.45, 0.62, printed.poster()),
-        ("N", 1.05, 1.42, 0.50, 0.70, printed.poster()),
-        ("N", 1.72, 1.50, 0.80, 0.55, printed.landscape()),
-        ("N", 2.66, 1.30, 0.36, 0.50, printed.poster()),
-        ("W", 0.90, 1.15, 0.55, 0.75, printed.poster()),
-        ("W", 1.65, 1.25, 0.90, 0.62, printed.landscape()),
-        ("W", 2.75, 1.12, 0.42, 0.58, printed.poster()),
-        ("S", 0.45, 1.10, 0.55, 0.75, printed.poster()),
-        ("S", 1.35, 1.55, 0.60, 0.42, printed.landscape()),
-        ("S", 2.25, 1.50, 0.40, 0.55, printed.poster()),
-        ("S", 2.85, 1.05, 0.42, 0.60, printed.poster()),
-        ("E", 0.15, 1.20, 0.50, 0.68, printed.poster()),
-        ("E", 3.30, 1.25, 0.50, 0.70, printed.poster()),
+        ("N", 0.25, 1.15, 0.45, 0.62, prints.poster()),
+        ("N", 1.05, 1.42, 0.50, 0.70, prints.poster()),
+        ("N", 1.72, 1.50, 0.80, 0.55, prints.landscape()),
+        ("N", 2.66, 1.30, 0.36, 0.50, prints.poster()),
+        ("W", 0.90, 1.15, 0.55, 0.75, prints.poster()),
+        ("W", 1.65, 1.25, 0.90, 0.62, prints.landscape()),
+        ("W", 2.75, 1.12, 0.42, 0.58, prints.poster()),
+        ("S", 0.45, 1.10, 0.55, 0.75, prints.poster()),
+        ("S", 1.35, 1.55, 0.60, 0.42, prints.landscape()),
+        ("S", 2.25, 1.50, 0.40, 0.55, prints.poster()),
+        ("S", 2.85, 1.05, 0.42, 0.60, prints.poster()),
+        ("E", 0.15, 1.20, 0.50, 0.68, prints.poster()),
+        ("E", 3.30, 1.25, 0.50, 0.70, prints.poster()),
     ):
         edge = paint.wood(_toned(rng, (0.36, 0.27, 0.20)))
         out += _hung(wall, a - 0.03, z - 0.03, w + 0.06, h + 0.06, 0.018, edge, edge)
         out += _hung(wall, a, z, w, h, 0.022, print_, edge)
-    dial = lathe((0.0, 0.0, 0.0), [(1e-4, 0.03), (0.15, 0.03)], printed.clock())
+    dial = lathe((0.0, 0.0, 0.0), [(1e-4, 0.03), (0.15, 0.03)], prints.clock())
     rim = lathe((0.0, 0.0, 0.0), [(0.15, 0.03), (0.15, 0.0)], paint.plain((0.15, 0.15, 0.17)))
-    for part in (dial, rim):  # turned from lying to hanging on the north wall
+    for part in (dial, rim):  # rotated from horizontal to hang on the north wall
         x, y, z = np.moveaxis(part.points, -1, 0)
         out.append(replace(part, points=np.stack([x + 2.85, ROOM_M[1] - z, y + 2.15], axis=-1)))
     return out

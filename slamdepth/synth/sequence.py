@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The synthetic sequence: a furnished room in the TUM layout with exact depth and poses."""
+"""The synthetic sequence: a furnished room in TUM layout with exact depth and poses."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from slamdepth.datasets.camera_file import CAMERA_FILE, write_camera
+from slamdepth.calibration import CAMERA_FILE
 from slamdepth.errors import ConfigError, OutputError
-from slamdepth.io import replacing, write_text, write_tum_trajectory
+from slamdepth.io import replacing, write_camera, write_text, write_tum_trajectory
 from slamdepth.types import Camera, Frame, Trajectory
+from slamdepth.typing import Floats, Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,16 +23,16 @@ if TYPE_CHECKING:
     from slamdepth.synth.render import Renderer
 
 SCENE_VERSION = 1
-"""To be raised with every change that changes a pixel: a folder of another version is not continued."""
+"""To be raised with every change of a pixel: a folder of another version is not continued."""
 
 SETTINGS_FILE = "synth.yaml"
-"""Lies in every rendered folder and says how it was rendered."""
+"""File in every rendered folder with the settings it was rendered with."""
 
 _TEXEL_AT_640_M = 0.0025
 
 
 class SynthSettings(BaseModel):
-    """What to render. The same settings give the same bytes."""
+    """Settings of a sequence. The same settings give the same bytes."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -40,9 +41,7 @@ class SynthSettings(BaseModel):
     width: int = Field(640, ge=32, le=4096, description="image width in pixels")
     height: int = Field(480, ge=32, le=4096, description="image height in pixels")
     seed: int = Field(0, ge=0, description="seed of layout, colours, path and noise")
-    texture: Literal["rich", "low", "bare"] = Field(
-        "rich", description="how much there is to see on surfaces"
-    )
+    texture: Literal["rich", "low", "bare"] = Field("rich", description="amount of texture on surfaces")
     lighting_variation: float = Field(
         0.05, ge=0, le=1, description="swing of exposure and white balance over the sequence, relative"
     )
@@ -78,7 +77,7 @@ class SynthSettings(BaseModel):
 
 
 def synth_camera(settings: SynthSettings) -> Camera:
-    """The undistorted camera of the sequence: 63 degrees wide, as a Kinect is."""
+    """The undistorted camera of the sequence, with a horizontal field of view of 63 degrees as a Kinect."""
     focal = 525.0 * settings.width / 640.0
     return Camera(
         settings.width, settings.height, focal, focal,
@@ -87,18 +86,16 @@ def synth_camera(settings: SynthSettings) -> Camera:
 
 
 def synth_trajectory(settings: SynthSettings) -> Trajectory:
-    """Exact camera poses; the first and the last frame share one viewpoint."""
+    """Exact camera poses. The first and last frame have the same viewpoint."""
     index = np.arange(settings.frames, dtype=np.float64)
     return Trajectory(np.round(index / settings.fps, 6), _poses(settings, index))
 
 
-def render_frames(
-    settings: SynthSettings, indices: Iterable[int]
-) -> Iterator[tuple[Frame, NDArray[np.float64]]]:
+def render_frames(settings: SynthSettings, indices: Iterable[int]) -> Iterator[tuple[Frame, Floats]]:
     """Render frames in memory: ``(frame with depth, T_world_camera (4, 4))`` for each index.
 
-    The depth is not rounded to the 0.2 mm of a depth file. Building the room takes
-    seconds, so ask for all frames in one call.
+    Depth is not rounded to the 0.2 mm of a depth file. Building the room takes seconds, so request all
+    frames in one call.
     """
     renderer = make_renderer(settings)
     for index in indices:
@@ -116,10 +113,8 @@ def make_renderer(settings: SynthSettings) -> Renderer:
     )
 
 
-def render_frame(
-    renderer: Renderer, settings: SynthSettings, index: int
-) -> tuple[Frame, NDArray[np.float64]]:
-    """One frame of the sequence and its pose; see :func:`render_frames`."""
+def render_frame(renderer: Renderer, settings: SynthSettings, index: int) -> tuple[Frame, Floats]:
+    """Render frame ``index``: the frame with depth and its ``T_world_camera (4, 4)``."""
     shutter = (np.arange(settings.motion_blur) + 0.5) / settings.motion_blur - 0.5
     T_world_camera = _poses(settings, np.array([float(index)]))[0]
     colour, depth = renderer.render(T_world_camera)
@@ -142,13 +137,13 @@ def render_sequence(
 ) -> Path:
     """Write the sequence to the folder ``output`` in TUM layout; returns ``output``.
 
-    An interrupted rendering goes on where it stopped: every file is written whole or
-    not at all, and the lists (``rgb.txt`` ...) come last.
+    An interrupted rendering resumes where it stopped: each file is written whole or not at all, and
+    the lists (``rgb.txt`` ...) are written last.
 
     Args:
-        output: a new or empty folder, or one begun with the same settings.
+        output: a new or empty folder, or one started with the same settings.
         settings: what to render.
-        progress: called with (frames done, frames in all).
+        progress: called with (frames done, total frames).
 
     Raises:
         OutputError: the folder holds something else or cannot be written.
@@ -166,7 +161,7 @@ def _render_sequence(
     _claim(output, settings)
     for folder in (output / "rgb", output / "depth"):
         folder.mkdir(exist_ok=True)
-        for leftover in folder.glob(".*.partial.*"):  # of a rendering that was killed
+        for leftover in folder.glob(".*.partial.*"):  # from a killed rendering
             leftover.unlink(missing_ok=True)
     trajectory = synth_trajectory(settings)
     camera = synth_camera(settings)
@@ -187,7 +182,7 @@ def _render_sequence(
 
 
 def _claim(output: Path, settings: SynthSettings) -> None:
-    """Make ``output`` ours, or say whose it is."""
+    """Prepare ``output`` for these settings, or raise OutputError if it holds something else."""
     record = {"scene_version": SCENE_VERSION, **settings.model_dump(mode="json")}
     record_file = output / SETTINGS_FILE
     if output.exists() and not output.is_dir():
@@ -221,15 +216,15 @@ def _write_lists(output: Path, trajectory: Trajectory, camera: Camera) -> None:
     write_camera(output / CAMERA_FILE, camera)
 
 
-def _poses(settings: SynthSettings, index: NDArray[np.float64]) -> NDArray[np.float64]:
+def _poses(settings: SynthSettings, index: Floats) -> Floats:
     from slamdepth.synth.path import path_poses
 
     last = settings.frames - 1
     return path_poses(index / last, last / settings.fps, settings.seed)
 
 
-def _photograph(colour: NDArray[np.float32], settings: SynthSettings, index: int) -> NDArray[np.uint8]:
-    """Exposure drift, white balance drift and sensor noise over rendered sRGB values 0 to 255."""
+def _photograph(colour: Floats32, settings: SynthSettings, index: int) -> NDArray[np.uint8]:
+    """Rendered sRGB values 0 to 255 with drift of exposure and white balance, and sensor noise."""
     if settings.lighting_variation > 0:
         rng = np.random.default_rng([settings.seed, 5])
         phase = rng.uniform(0, 2 * np.pi, 3)

@@ -1,26 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Textured surfaces of the synthetic room: grids of points with a paint.
 
-Every shape is a list of :class:`Surface`; a surface is a grid of points ``(rows,
-columns, 3)`` in the world (z up, metres), seen from the side its normals point to, with
-the row axis running down its texture. Each owns a rectangle of the texture atlas.
+A shape is one :class:`Surface` or a list of them. A surface is a grid of points ``(rows, columns, 3)`` in
+the world (z up, metres), visible from the side of its normals, with the rows running down its texture. Each
+has its own rectangle in the texture atlas.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.typing import Floats
+from slamdepth.typing import Floats, Floats32, Ints
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-
-Paint = Callable[[np.random.Generator, int, int, float], "NDArray[np.float32]"]
+Paint = Callable[[np.random.Generator, int, int, float], Floats32]
 """``paint(rng, height, width, texel_m) -> (height, width, 3)`` float32 sRGB 0 to 1."""
 
 
@@ -32,8 +27,8 @@ class Surface:
         points: ``(rows, columns, 3)`` metres.
         size_m: length along a row and down a column.
         paint: makes its texture.
-        emission: above 0, the patch glows: its texture times this, unlit.
-        texel_scale: coarser texels where little is to be seen (a ceiling).
+        emission: above 0, the patch emits its texture times this factor and is not lit.
+        texel_scale: factor on the texel size, above 1 for surfaces with little detail.
     """
 
     points: Floats
@@ -44,19 +39,19 @@ class Surface:
 
     @property
     def normals(self) -> Floats:
-        """``(rows, columns, 3)`` unit normals at the grid points, towards the visible side."""
+        """Unit normals ``(rows, columns, 3)`` at the grid points, towards the visible side."""
         along = np.gradient(self.points, axis=1)
         down = np.gradient(self.points, axis=0)
         normal = np.cross(down, along)
         length = np.linalg.norm(normal, axis=2, keepdims=True)
         mean = normal.sum(axis=(0, 1))
-        # The poles of a sphere have no normal of their own: take the radial direction's stand-in.
+        # The normal is undefined at the poles of a sphere: use the mean normal there.
         flat = np.broadcast_to(mean / max(float(np.linalg.norm(mean)), 1e-12), normal.shape)
         return np.where(length > 1e-12, normal / np.maximum(length, 1e-12), flat)
 
     @property
-    def triangles(self) -> NDArray[np.int64]:
-        """``(T, 3)`` over the flattened grid of points."""
+    def triangles(self) -> Ints:
+        """Triangles ``(T, 3)``, indices into the flattened grid of points."""
         rows, columns = self.points.shape[:2]
         corner = np.arange(rows * columns).reshape(rows, columns)
         a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]
@@ -74,7 +69,7 @@ def quad(
     emission: float = 0.0,
     texel_scale: float = 1.0,
 ) -> Surface:
-    """A rectangle from its top left corner; ``down x along`` points to the viewer."""
+    """A rectangle given by its top left corner; ``down x along`` points towards the viewer."""
     o, a, d = (np.asarray(v, dtype=np.float64) for v in (origin, along, down))
     points = np.array([[o, o + a], [o + d, o + d + a]])
     size = (float(np.linalg.norm(a)), float(np.linalg.norm(d)))
@@ -90,9 +85,9 @@ def box(
     bottom: bool = False,
     texel_scale: float = 1.0,
 ) -> list[Surface]:
-    """A box from its low corner; ``yaw`` radians turn it about its vertical middle line.
+    """A box given by its lowest corner, rotated by ``yaw`` radians about its vertical centre line.
 
-    ``paint`` may name ``+x -x +y -y +z -z`` apart, with ``*`` for the rest.
+    ``paint`` may be a dict with the faces ``+x -x +y -y +z -z``, and ``*`` for all others.
     """
     paints = paint if isinstance(paint, dict) else {"*": paint}
     sx, sy, sz = size
@@ -125,7 +120,7 @@ def box(
 def lathe(
     base: tuple[float, float, float], profile: list[tuple[float, float]], paint: Paint, *, segments: int = 40
 ) -> Surface:
-    """A turned shape: ``profile`` lists ``(radius, height over base)`` from the top down."""
+    """A surface of revolution; ``profile`` lists ``(radius, height above base)`` from the top down."""
     angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
     angle[-1] = 0.0  # close the seam exactly
     radius, height = (np.array(column) for column in zip(*profile, strict=True))
@@ -154,13 +149,13 @@ def ellipsoid(
     longitude = np.linspace(0.0, 2.0 * np.pi, 49)[None, :].copy()
     longitude[0, -1] = 0.0
 
-    def bent(value: Floats) -> Floats:
+    def curve(value: Floats) -> Floats:
         return np.sign(value) * np.abs(value) ** power
 
     points = np.empty((25, 49, 3))
-    points[..., 0] = centre[0] + radii[0] * bent(np.cos(latitude)) * bent(np.cos(longitude))
-    points[..., 1] = centre[1] + radii[1] * bent(np.cos(latitude)) * bent(np.sin(longitude))
-    points[..., 2] = centre[2] + radii[2] * bent(np.sin(latitude)) * np.ones_like(longitude)
+    points[..., 0] = centre[0] + radii[0] * curve(np.cos(latitude)) * curve(np.cos(longitude))
+    points[..., 1] = centre[1] + radii[1] * curve(np.cos(latitude)) * curve(np.sin(longitude))
+    points[..., 2] = centre[2] + radii[2] * curve(np.sin(latitude)) * np.ones_like(longitude)
     size = (2.0 * np.pi * max(radii[:2]), np.pi * max(radii))
     return Surface(points, size, paint)
 

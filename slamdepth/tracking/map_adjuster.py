@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamdepth.backend.bundle import CHI2_2DOF_95, BundleProblem, BundleResult, bundle_adjust
+from slamdepth.backend.bundle import BundleProblem, BundleResult, bundle_adjust
 from slamdepth.backend.resection import placed_anew
 from slamdepth.config import Config
-from slamdepth.geometry import invert, orthonormalised, transform
+from slamdepth.geometry import CHI2_2DOF_95, invert, orthonormalised, transform
 from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
 from slamdepth.tracking.shutter import Shutter
 from slamdepth.tracking.side_thread import SideThread

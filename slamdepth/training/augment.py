@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training views: a real RGB + depth pair seen by a virtual camera turned and zoomed in place.
+"""Training views: a real RGB-D image seen by a virtual camera that is rotated and zoomed in place.
 
-A camera that only turns sees the same scene through a homography, so roll, pan, tilt and
-zoom of a pair are exact, depth included. What is wanted is variety the recordings lack:
-held-rolled cameras, other focal lengths, other distances, other light.
+A purely rotated camera sees the same scene through a homography, so roll, pan, tilt and zoom are
+exact, depth included. The views add variety that the recordings lack: rolled cameras, other focal
+lengths, other distances, other light.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from slamdepth.geometry import so3_exp
 from slamdepth.training.config import AugmentConfig
 from slamdepth.training.lens import raw_pixels
 from slamdepth.types import Frame
+from slamdepth.typing import Floats, Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,13 +32,13 @@ class View:
         image_rgb: ``(rows, columns, 3)`` uint8.
         depth_m: ``(rows, columns)`` float32, 0 where unknown.
         focal_px: focal length in pixels of ``image_rgb``.
-        down: ``(3,)`` unit direction of gravity in the view's camera frame; zeros where unknown.
+        gravity: ``(3,)`` unit direction of gravity in the view's camera frame; zeros if unknown.
     """
 
     image_rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
+    depth_m: Floats32
     focal_px: float
-    down: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    gravity: Floats = field(default_factory=lambda: np.zeros(3))
 
 
 def augmented_view(
@@ -46,13 +47,13 @@ def augmented_view(
     columns: int,
     config: AugmentConfig,
     rng: np.random.Generator,
-    down: NDArray[np.float64] | None = None,
+    gravity: Floats | None = None,
 ) -> View:
     """A random view of ``frame`` (which has depth) at ``rows`` x ``columns`` pixels.
 
     Args:
-        down: ``(3,)`` unit direction of gravity in the frame's camera. The view is then turned about
-            upright, not about how the camera was held.
+        gravity: ``(3,)`` unit direction of gravity in the frame's camera. If given, the random roll is
+            about upright and not about the camera's own orientation.
     """
     flip = rng.random() < config.flip
     rolled = rng.random() < config.rolled
@@ -61,21 +62,25 @@ def augmented_view(
         if rolled
         else rng.normal(0.0, config.upright_roll_deg)
     )
-    if down is not None:
-        roll -= float(np.degrees(roll_rad(down)))
+    if gravity is not None:
+        roll -= float(np.degrees(roll_rad(gravity)))
     tilt = rng.uniform(-config.max_tilt_deg, config.max_tilt_deg, 2)
     zoom = _zoom(config, roll, rng)
-    R_camera_view = _turn(roll, tilt[0], tilt[1])
+    R_camera_view = _rotation(roll, tilt[0], tilt[1])
     image, depth, focal = seen_from(frame, rows, columns, R_camera_view, zoom, flip)
-    return View(photometric(image, config, rng), depth, focal, _down_in_view(down, R_camera_view, flip))
+    return View(photometric(image, config, rng), depth, focal, _gravity_in_view(gravity, R_camera_view, flip))
 
 
-def plain_view(frame: Frame, rows: int, columns: int, down: NDArray[np.float64] | None = None) -> View:
-    """``frame`` seen by its own camera with square pixels, centred, at ``rows`` x ``columns``; rolled
-    upright where ``down (3,)``, the direction of gravity in its frame, is known."""
-    R_camera_view = _turn(0.0 if down is None else -float(np.degrees(roll_rad(down))), 0.0, 0.0)
+def unaugmented_view(frame: Frame, rows: int, columns: int, gravity: Floats | None = None) -> View:
+    """``frame`` at ``rows`` x ``columns`` with square pixels and a centred principal point.
+
+    Args:
+        gravity: ``(3,)`` unit direction of gravity in the frame's camera. If given, the view is rolled
+            upright.
+    """
+    R_camera_view = _rotation(0.0 if gravity is None else -float(np.degrees(roll_rad(gravity))), 0.0, 0.0)
     seen = seen_from(frame, rows, columns, R_camera_view, 1.0, False)
-    return View(*seen, _down_in_view(down, R_camera_view, False))
+    return View(*seen, _gravity_in_view(gravity, R_camera_view, False))
 
 
 def matching_view(
@@ -84,19 +89,20 @@ def matching_view(
     columns: int,
     config: AugmentConfig,
     rng: np.random.Generator,
-    down: NDArray[np.float64],
-    wanted: NDArray[np.float64],
+    gravity: Floats,
+    wanted: Floats,
 ) -> View:
-    """A random view of ``frame`` in which gravity points as ``wanted``, so that both can be one scene.
+    """A random view of ``frame`` in which gravity points along ``wanted``, to be mixed into another.
 
     Args:
-        down: ``(3,)`` unit direction of gravity in the frame's camera.
-        wanted: ``(3,)`` that in the view. Their angles below the horizon should differ little.
+        gravity: ``(3,)`` unit direction of gravity in the frame's camera.
+        wanted: ``(3,)`` unit direction of gravity in the view. The angles of both to the horizon
+            should differ little.
     """
     flip = rng.random() < config.flip
     unflipped = wanted * [-1.0, 1.0, 1.0] if flip else wanted
-    about_down = so3_exp(unflipped * np.radians(rng.uniform(-config.max_tilt_deg, config.max_tilt_deg)))
-    R_camera_view = _taking(unflipped, down) @ about_down
+    about_gravity = so3_exp(unflipped * np.radians(rng.uniform(-config.max_tilt_deg, config.max_tilt_deg)))
+    R_camera_view = _rotation_between(unflipped, gravity) @ about_gravity
     roll = float(np.degrees(np.arctan2(R_camera_view[1, 0], R_camera_view[0, 0])))
     zoom = _zoom(config, roll, rng)
     image, depth, focal = seen_from(frame, rows, columns, R_camera_view, zoom, flip)
@@ -104,19 +110,22 @@ def matching_view(
 
 
 def _zoom(config: AugmentConfig, roll_deg: float, rng: np.random.Generator) -> float:
-    # A rolled view without zoom would show more of the mirrored border than of the scene.
+    # Without zoom a rolled view would show more of the mirrored border than of the scene.
     least = 1.0 + 0.25 * abs(np.sin(np.radians(roll_deg)))
     return float(np.exp(rng.uniform(np.log(least), np.log(max(config.max_zoom, least)))))
 
 
-def _turn(roll_deg: float, pan_deg: float, tilt_deg: float) -> NDArray[np.float64]:
+def _rotation(roll_deg: float, pan_deg: float, tilt_deg: float) -> Floats:
     """``R_camera_view (3, 3)``."""
     return so3_exp(np.radians([0.0, 0.0, roll_deg])) @ so3_exp(np.radians([tilt_deg, pan_deg, 0.0]))
 
 
-def _taking(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation ``(3, 3)`` that takes one unit vector to the other: a roll about the optical axis, then
-    the pitch that is left, so that the axis moves no more than it has to."""
+def _rotation_between(source: Floats, target: Floats) -> Floats:
+    """The rotation ``(3, 3)`` that takes the unit vector ``source`` to ``target``.
+
+    It is a roll about the optical axis followed by the remaining pitch, so the axis moves as little
+    as possible.
+    """
     roll = np.arctan2(target[1], target[0]) - np.arctan2(source[1], source[0])
     R_roll = so3_exp(np.array([0.0, 0.0, roll]))
     rolled = R_roll @ source
@@ -124,25 +133,24 @@ def _taking(source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray
     sine = float(np.linalg.norm(axis))
     if sine < 1e-12:
         return R_roll
-    return so3_exp(axis / sine * np.arctan2(sine, rolled @ target)) @ R_roll
+    R_pitch = so3_exp(axis / sine * np.arctan2(sine, rolled @ target))
+    return np.asarray(R_pitch @ R_roll)
 
 
-def _down_in_view(
-    down: NDArray[np.float64] | None, R_camera_view: NDArray[np.float64], flip: bool
-) -> NDArray[np.float64]:
-    if down is None:
+def _gravity_in_view(gravity: Floats | None, R_camera_view: Floats, flip: bool) -> Floats:
+    if gravity is None:
         return np.zeros(3)
-    seen = R_camera_view.T @ down
+    seen = np.asarray(R_camera_view.T @ gravity)
     return seen * [-1.0, 1.0, 1.0] if flip else seen
 
 
 def mixed_view(first: View, second: View) -> View:
-    """Both scenes in one: of each pixel what is nearer, at the focal length of ``first``.
+    """Both scenes composed into one: at each pixel the nearer surface, at the focal length of ``first``.
 
-    Two pairs are put into one canonical camera, so that sizes and depths stay true, and
-    occlude one another as solid scenes would. What a network can learn by heart of a place
-    (this counter, so that wall) is broken up; what a surface itself tells of its depth stays.
-    Where a sensor saw nothing the depth of the nearest pixel decides, and the result is unknown.
+    Both views are brought into one canonical camera, so sizes and depths stay true and the scenes
+    occlude one another as solid ones would. This breaks up the layout of a place, which a network
+    would memorise, and keeps the local cues of a surface. Where one depth is unknown, that of its
+    nearest known pixel decides, and the result is unknown.
     """
     factor = np.float32(first.focal_px / second.focal_px)
     second_m = second.depth_m * factor
@@ -151,12 +159,12 @@ def mixed_view(first: View, second: View) -> View:
         np.where(in_front[..., None], first.image_rgb, second.image_rgb),
         np.where(in_front, first.depth_m, second_m),
         first.focal_px,
-        first.down,
+        first.gravity,
     )
 
 
-def _completed(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """``(H, W)`` with each unknown pixel given the depth of the nearest known one."""
+def _completed(depth_m: Floats32) -> Floats32:
+    """``(H, W)`` with each unknown pixel set to the depth of the nearest known one."""
     import cv2
 
     unknown = depth_m <= 0
@@ -169,7 +177,7 @@ def _completed(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     )
     of_label = np.zeros(int(label.max()) + 1, np.float32)
     of_label[label[~unknown]] = depth_m[~unknown]
-    return of_label[label]
+    return np.asarray(of_label[label])
 
 
 def turned_view(
@@ -181,19 +189,23 @@ def turned_view(
     tilt_deg: float,
     zoom: float,
     flip: bool,
-) -> tuple[NDArray[np.uint8], NDArray[np.float32], float]:
-    """Image, depth and focal length (px) of ``frame``, see :func:`seen_from`, turned by angles."""
-    return seen_from(frame, rows, columns, _turn(roll_deg, pan_deg, tilt_deg), zoom, flip)
+) -> tuple[NDArray[np.uint8], Floats32, float]:
+    """Image, depth and focal length (px) of ``frame`` rotated by angles; see :func:`seen_from`."""
+    return seen_from(frame, rows, columns, _rotation(roll_deg, pan_deg, tilt_deg), zoom, flip)
 
 
 def seen_from(
-    frame: Frame, rows: int, columns: int, R_camera_view: NDArray[np.float64], zoom: float, flip: bool
-) -> tuple[NDArray[np.uint8], NDArray[np.float32], float]:
+    frame: Frame, rows: int, columns: int, R_camera_view: Floats, zoom: float, flip: bool
+) -> tuple[NDArray[np.uint8], Floats32, float]:
     """Image, depth and focal length (px) of ``frame`` after an exact camera rotation.
 
-    ``R_camera_view (3, 3)`` takes directions of the view, before it is mirrored, to the frame's.
-    The view is that of a pinhole: lens distortion of ``frame.camera`` is undone.
-    Pixels from outside the frame mirror its border and have depth 0.
+    The view is that of a pinhole camera: the lens distortion of ``frame.camera`` is removed. Pixels
+    outside the frame mirror its border and have depth 0.
+
+    Args:
+        R_camera_view: ``(3, 3)``, takes directions of the view, before it is flipped, to the frame's.
+        zoom: focal length over that at which the view spans the frame.
+        flip: mirror the view from left to right.
     """
     import cv2
 
@@ -215,7 +227,7 @@ def seen_from(
     raw: NDArray[Any] = cv2.remap(
         frame.depth_m, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
     )
-    # A point at z on its old ray lies at z / ray_z on the new optical axis's depth.
+    # Depth changes from along the old optical axis to along the new one.
     depth = raw / rays[..., 2].astype(np.float32)
     return image, depth.astype(np.float32), float(focal)
 
@@ -223,7 +235,7 @@ def seen_from(
 def photometric(
     image_rgb: NDArray[np.uint8], config: AugmentConfig, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Random light, tint, saturation, blur, noise and compression of ``(H, W, 3)`` uint8."""
+    """``image_rgb (H, W, 3)`` uint8 with random light, tint, saturation, blur, noise and compression."""
     import cv2
 
     x: NDArray[Any] = image_rgb.astype(np.float32) / 255.0
@@ -251,7 +263,7 @@ def photometric(
     return out
 
 
-def _motion_kernel(length: int, angle_rad: float) -> NDArray[np.float32]:
+def _motion_kernel(length: int, angle_rad: float) -> Floats32:
     import cv2
 
     kernel = np.zeros((length, length), np.float32)
@@ -259,4 +271,4 @@ def _motion_kernel(length: int, angle_rad: float) -> NDArray[np.float32]:
     step = centre * np.array([np.cos(angle_rad), np.sin(angle_rad)])
     a, b = np.round(centre - step).astype(int), np.round(centre + step).astype(int)
     cv2.line(kernel, tuple(map(int, a)), tuple(map(int, b)), 1.0)
-    return kernel / kernel.sum()
+    return np.asarray(kernel / kernel.sum())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which features a training needs, and the folders they are cached in."""
+"""The feature caches that a training needs, and their folders."""
 
 from __future__ import annotations
 
@@ -11,30 +11,31 @@ from typing import TypeVar
 from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
 from slamdepth.errors import ConfigError
-from slamdepth.training.config import Teaches, TrainConfig, ViewConfig, digest
+from slamdepth.training.config import SourceConfig, Supervision, TrainConfig, ViewConfig, digest
 from slamdepth.training.data import Place, PlaceReader, data_folder, open_place
 from slamdepth.training.features import FeatureCache, build_cache
 from slamdepth.training.progress import Progress, silent
-from slamdepth.training.views import Partner, SampleKey, plan_plain, plan_samples
+from slamdepth.training.views import Partner, SampleKey, plan_samples, plan_unaugmented
 
-_JUDGED_VIEWS = 50
+_HELD_OUT_VIEWS = 50
 _T = TypeVar("_T")
 _VIEW_VERSION = 4
-"""Counts up where the same settings make other views or features."""
+"""To be raised when the same settings give other views or features."""
 
 
 @dataclass(frozen=True)
 class PlannedCache:
-    """One cache before it is filled: a source's samples, or the plain views of a held-out place.
+    """One cache before it is filled: the samples of a source, or unaugmented views of a held-out place.
 
     Attributes:
-        folder: where it is kept; its name hashes all that decides on its content.
+        folder: where it is kept; its name is a hash of everything that determines its content.
+        places: the places that ``keys`` refer to.
         keys: its samples, in order.
-        view: how they are made.
-        members: heads that learn from it; None where all do.
-        partners: what is mixed into them: all places that are trained on.
-        held_out: name of the place where it is for judging, else None.
-        teaches: what is learnt from it.
+        view: how they are rendered.
+        held_out: name of the place if it is for evaluation, else None.
+        partners: places mixed into its views: all that are trained on.
+        members: ensemble members trained on it; None for all.
+        supervision: what its samples supervise.
     """
 
     folder: Path
@@ -44,7 +45,12 @@ class PlannedCache:
     held_out: str | None = None
     partners: tuple[Partner, ...] = ()
     members: tuple[int, ...] | None = None
-    teaches: Teaches = "both"
+    supervision: Supervision = "both"
+
+    @property
+    def trains_depth(self) -> bool:
+        """True if depth heads are trained on it."""
+        return self.held_out is None and self.supervision != "gravity"
 
 
 @dataclass(frozen=True)
@@ -52,8 +58,8 @@ class Encoder:
     """A backbone whose features are cached.
 
     Attributes:
-        backbone: frozen, in the precision it computes in.
-        sha256: of its file; "given" where it came from no file.
+        backbone: the frozen network, in the precision it computes in.
+        sha256: hash of its weights file; "given" if it was passed in memory.
     """
 
     backbone: DinoV2
@@ -61,12 +67,12 @@ class Encoder:
 
     @property
     def key(self) -> str:
-        """Differs where features do: bfloat16 rounds otherwise than float32."""
+        """Identifies the features: weights and precision, since bfloat16 rounds differently from float32."""
         return f"{self.sha256} {self.backbone.cls_token.dtype}"
 
 
 def open_encoder(file: str | None, device: str = "cpu") -> Encoder:
-    """The backbone of ``file`` (default: the cached one), in the precision ``device`` is best at.
+    """The backbone in ``file`` (default: the cached one), in the preferred precision of ``device``.
 
     Raises:
         WeightsError: it is missing or damaged.
@@ -79,37 +85,29 @@ def open_encoder(file: str | None, device: str = "cpu") -> Encoder:
 def plan_caches(
     config: TrainConfig, encoder_key: str, readers: Mapping[str, PlaceReader] | None = None
 ) -> list[PlannedCache]:
-    """Open every place of ``config`` and say what is to be computed of it.
+    """Open every place of ``config`` and determine the caches it needs.
 
-    A source that no member learns from is opened, since its places may be mixed into
-    others, but has no cache.
+    A source that trains no member is opened, since its places may be mixed into others, but gets no
+    cache.
 
     Args:
-        encoder_key: of the backbone whose features they are, see :class:`Encoder`.
-        readers: readers beside those of :mod:`slamdepth.training.readers`.
+        encoder_key: identifies the backbone and its precision, see :class:`Encoder`.
+        readers: further readers, in addition to those of :mod:`slamdepth.training.readers`.
 
     Raises:
-        ConfigError: a place is both trained on and held out, or none is trained on.
+        ConfigError: a place is both trained on and held out, or a member has nothing to train on.
         DatasetError: a place is missing or malformed.
     """
-    roots = [data_folder(source.folder) for source in config.sources]
-    both = list(zip(roots, config.sources, strict=True))
-    trained = {(root / place.name).resolve() for root, source in both for place in source.places}
-    judged = {(root / name).resolve() for root, source in both for name in source.held_out}
-    if trained & judged:
-        raise ConfigError(f"setting 'sources': {min(trained & judged).name} is held out and also trained on")
-    for member in range(config.members):
-        teachers = [source for source in config.sources if source.places and source.teaches != "down"]
-        if not any(_teaches(source.members, member) for source in teachers):
-            raise ConfigError(f"setting 'sources': there is no place to train on for member {member}")
+    sources = [(data_folder(source.folder), source) for source in config.sources]
+    _check_places(config, sources)
 
     def where(view: ViewConfig, places: tuple[Place, ...], *more: object) -> Path:
-        made_of = [place.fingerprint for place in places]
-        name = digest(view, _VIEW_VERSION, config.head.taps, config.seed, encoder_key, made_of, *more)
+        fingerprints = [place.fingerprint for place in places]
+        name = digest(view, _VIEW_VERSION, config.head.taps, config.seed, encoder_key, fingerprints, *more)
         return store.cache_dir() / "features" / name
 
-    planned = []
-    for folder, source in both:
+    training = []
+    for folder, source in sources:
         if not source.places:
             continue
         places = tuple(open_place(folder / place.name, source.reader, readers) for place in source.places)
@@ -117,24 +115,52 @@ def plan_caches(
         view = config.view
         if source.augment is not None:
             view = view.model_copy(update={"augment": source.augment})
-        planned.append(
+        training.append(
             PlannedCache(
                 where(view, places, source.places, source.limit),
                 places,
                 tuple(keys),
                 view,
                 members=source.members,
-                teaches=source.teaches,
+                supervision=source.supervision,
             )
         )
+    held_out = []
+    for folder, source in sources:
+        for name in source.held_out:
+            place = open_place(folder / name, source.reader, readers)
+            keys = plan_unaugmented(0, place, _HELD_OUT_VIEWS)
+            held_out.append(
+                PlannedCache(where(config.view, (place,), "plain"), (place,), tuple(keys), config.view, name)
+            )
+    members = range(config.members)
+    return [
+        cache for cache in _with_partners(training) if any(_trains(cache.members, m) for m in members)
+    ] + held_out
+
+
+def _check_places(config: TrainConfig, sources: Sequence[tuple[Path, SourceConfig]]) -> None:
+    """Raise ConfigError if a place is trained on and held out, or a member has nothing to train on."""
+    trained = {(folder / place.name).resolve() for folder, source in sources for place in source.places}
+    held_out = {(folder / name).resolve() for folder, source in sources for name in source.held_out}
+    if both := trained & held_out:
+        raise ConfigError(f"setting 'sources': {min(both).name} is held out and also trained on")
+    depth = [source for source in config.sources if source.places and source.supervision != "gravity"]
+    for member in range(config.members):
+        if not any(_trains(source.members, member) for source in depth):
+            raise ConfigError(f"setting 'sources': there is no place to train on for member {member}")
+
+
+def _with_partners(training: Sequence[PlannedCache]) -> list[PlannedCache]:
+    """The caches with partners and another folder where their views are mixed."""
     partners = tuple(
         Partner(place, cache.view.augment, sum(key.place == index for key in cache.keys))
-        for cache in planned
-        if cache.teaches != "down"
+        for cache in training
+        if cache.trains_depth
         for index, place in enumerate(cache.places)
     )
     mixing = [(p.place.fingerprint, p.augment.model_dump_json(), p.weight) for p in partners]
-    planned = [
+    return [
         replace(
             cache,
             partners=partners,
@@ -142,35 +168,28 @@ def plan_caches(
         )
         if cache.view.augment.mixed
         else cache
-        for cache in planned
-        if any(_teaches(cache.members, member) for member in range(config.members))
+        for cache in training
     ]
-    for folder, source in both:
-        for name in source.held_out:
-            place = open_place(folder / name, source.reader, readers)
-            keys = plan_plain(0, place, _JUDGED_VIEWS)
-            planned.append(
-                PlannedCache(where(config.view, (place,), "plain"), (place,), tuple(keys), config.view, name)
-            )
-    return planned
 
 
-def _teaches(members: tuple[int, ...] | None, member: int) -> bool:
+def _trains(members: tuple[int, ...] | None, member: int) -> bool:
     return members is None or member in members
 
 
 def of_member(planned: Sequence[PlannedCache], each: Sequence[_T], member: int) -> list[_T]:
-    """Of what there is ``each`` planned cache, what belongs to those that ``member`` is trained on."""
+    """The elements of ``each``, one per planned cache, that ``member`` is trained on."""
     return [
         one
         for plan, one in zip(planned, each, strict=True)
-        if plan.held_out is None and plan.teaches != "down" and _teaches(plan.members, member)
+        if plan.trains_depth and _trains(plan.members, member)
     ]
 
 
 def of_gravity(planned: Sequence[PlannedCache], each: Sequence[_T]) -> list[_T]:
-    """The same of what the network learns from that finds out which way is down: views as they were
-    taken but for how they are turned."""
+    """The elements of ``each``, one per planned cache, that the gravity network is trained on.
+
+    These are the upright views that are not mixed.
+    """
     return [
         one
         for plan, one in zip(planned, each, strict=True)
@@ -187,16 +206,21 @@ def fill_cache(
     progress: Progress = silent,
     stage: str = "features",
 ) -> FeatureCache:
-    """Compute what is missing of ``planned``; errors of :func:`build_cache`."""
+    """Compute the missing samples of ``planned`` and open the cache.
+
+    Raises:
+        DatasetError: an image or its depth cannot be read.
+        OutputError: the folder cannot be written or the disk is too small.
+    """
     cache = build_cache(
         planned.folder, planned.places, planned.keys, planned.view, backbone, config.head.taps, config.seed,
         device=device, partners=planned.partners, progress=progress, stage=stage,
     )  # fmt: skip
-    return replace(cache, teaches=planned.teaches)
+    return replace(cache, supervision=planned.supervision)
 
 
-def benchmarks_seen(planned: list[PlannedCache]) -> dict[str, tuple[str, ...]]:
-    """The benchmarks a head trained on ``planned`` has seen, each with the places of it."""
+def benchmarks_seen(planned: Sequence[PlannedCache]) -> dict[str, tuple[str, ...]]:
+    """The benchmarks that a head trained on ``planned`` has seen, each with its places."""
     seen: dict[str, tuple[str, ...]] = {}
     for cache in planned:
         for place in cache.places if cache.held_out is None else ():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state of a member after each epoch, so that a killed training goes on."""
+"""Checkpoints of a member after each epoch, from which a killed training resumes."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ logger = logging.getLogger(__name__)
 
 
 def checkpoint_path(config: TrainConfig, member: int) -> Path:
-    """The checkpoint of ``member``, beside the output."""
+    """The checkpoint file of ``member``, in the folder of the output."""
     output = output_path(config)
     return output.with_name(f"{output.name}.member{member}.checkpoint")
 
 
 def save_checkpoint(path: Path, key: str, state: dict[str, Any]) -> None:
-    """Write ``state`` whole or not at all; the one before stays until it is on the disk.
+    """Write ``state`` whole or not at all; an earlier checkpoint stays until it is on disk.
 
     Raises:
         OutputError: the file cannot be written.
@@ -43,7 +43,7 @@ def save_checkpoint(path: Path, key: str, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path, key: str, device: str) -> dict[str, Any] | None:
-    """The state written under ``key``; None where there is none, or a damaged one, which is logged."""
+    """The state saved under ``key``; None, with a warning, if it is damaged or has another key."""
     if not path.is_file():
         return None
     try:
@@ -53,13 +53,13 @@ def load_checkpoint(path: Path, key: str, device: str) -> dict[str, Any] | None:
         logger.warning("%s: damaged, so this member starts again: %s", path, reason)
         return None
     if not isinstance(state, dict) or state.get("key") != key:
-        logger.warning("%s: of a training with other settings or data; this one starts afresh", path)
+        logger.warning("%s: of a training with other settings or data; starting from the beginning", path)
         return None
     return state
 
 
 def remove_checkpoints(config: TrainConfig, count: int) -> None:
-    """Remove what only a killed training needs, of ``count`` heads."""
+    """Remove the checkpoints of ``count`` heads, which only a killed training needs."""
     for member in range(count):
         path = checkpoint_path(config, member)
         path.unlink(missing_ok=True)
@@ -67,14 +67,14 @@ def remove_checkpoints(config: TrainConfig, count: int) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Wait until ``path`` and its name are on the disk."""
+    """Wait until the file ``path`` and its directory entry are on disk."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
     sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names in ``folder`` are on the disk."""
+    """Wait until the directory entries of ``folder`` are on disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

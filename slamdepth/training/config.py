@@ -21,13 +21,12 @@ from pydantic import (
 
 from slamdepth.errors import ConfigError
 
-Teaches = Literal["relief", "level", "both", "down"]
-"""What is learnt from views: the relief of each, its mean log depth (so its scale), both, or none of it
-but which way is down."""
-
+Supervision = Literal["scale", "shape", "both", "gravity"]
+"""What the views of a source supervise. A view's scale is its mean log depth, its shape the rest;
+``gravity`` trains the gravity network only, no depth."""
 
 _BLOCKS = 12
-"""Of the backbone, a ViT-S."""
+"""Transformer blocks of the backbone, a ViT-S."""
 
 
 class _Section(BaseModel):
@@ -35,7 +34,7 @@ class _Section(BaseModel):
 
 
 class AugmentConfig(_Section):
-    """What is done to a training image before the backbone sees it."""
+    """Random changes of a training image, made before the backbone sees it."""
 
     flip: float = Field(0.5, ge=0, le=1, description="share of mirrored images")
     upright_roll_deg: float = Field(6.0, ge=0, le=90, description="deviation of the roll of upright images")
@@ -46,46 +45,45 @@ class AugmentConfig(_Section):
     colour: float = Field(0.4, ge=0, le=1, description="strength of brightness, contrast, tint changes")
     blur: float = Field(0.3, ge=0, le=1, description="share of blurred images")
     noise: float = Field(0.3, ge=0, le=1, description="share of images with sensor noise")
-    jpeg: float = Field(0.5, ge=0, le=1, description="share of images compressed again")
+    jpeg: float = Field(0.5, ge=0, le=1, description="share of images compressed as JPEG")
     mixed: float = Field(
-        0.0, ge=0, le=1, description="share of views into which another is put, the nearer surface in front"
+        0.0, ge=0, le=1, description="share of views that are composed with another, nearer surfaces in front"
     )
-    mixed_again: float = Field(0.35, ge=0, le=1, description="share of those into which a third is put")
+    mixed_again: float = Field(0.35, ge=0, le=1, description="share of those that are composed with a third")
 
 
 class PlaceConfig(_Section):
     """One place, one camera: a folder of pairs, a sequence or a scene."""
 
     name: str = Field(description="folder below the data folder")
-    samples: int = Field(200, ge=1, description="augmented samples drawn from it, spread over its frames")
+    samples: int = Field(200, ge=1, description="augmented samples, spread over its frames")
 
 
 class SourceConfig(_Section):
-    """A folder of places. Each source has a feature cache of its own."""
+    """A folder of places. Each source has its own feature cache."""
 
     folder: str = Field(description="folder of the places; relative to $SLAMDEPTH_DATA if not absolute")
     reader: str | None = Field(
-        None, description="layout: pairs, hypersim, synth, tum, 7scenes; found out from the files if absent"
+        None, description="layout: pairs, hypersim, synth, tum, 7scenes; recognised from the files if absent"
     )
-    places: tuple[PlaceConfig, ...] = Field((), description="trained on")
+    places: tuple[PlaceConfig, ...] = Field((), description="places to train on")
     members: tuple[int, ...] | None = Field(
         None,
         min_length=1,
-        description="heads that learn from it, from 0; all if absent: heads that know "
-        "different things are worth more together than heads that differ by seed",
+        description="ensemble members trained on it, counted from 0; all if absent",
     )
-    augment: AugmentConfig | None = Field(None, description="of this source's views; view.augment if absent")
-    teaches: Teaches = Field(
-        "both", description="what is learnt from it: mixed views, say, show no true scale"
+    augment: AugmentConfig | None = Field(
+        None, description="augmentation of this source's views; view.augment if absent"
     )
-    held_out: tuple[str, ...] = Field((), description="places judged on after training, never trained on")
-    limit: int | None = Field(
-        None, ge=1, description="only so many of the samples, a random choice; leaves the others' views alone"
+    supervision: Supervision = Field(
+        "both", description="what its views supervise; mixed views, for example, show no true scale"
     )
+    held_out: tuple[str, ...] = Field((), description="places to evaluate on, never trained on")
+    limit: int | None = Field(None, ge=1, description="use only this many of the samples, chosen at random")
 
 
 class ViewConfig(_Section):
-    """How a pair is shown to the backbone."""
+    """How an image is presented to the backbone."""
 
     rows: int = Field(196, ge=28, multiple_of=14, description="height of the network input")
     columns: int = Field(266, ge=28, multiple_of=14, description="width of the network input")
@@ -94,8 +92,8 @@ class ViewConfig(_Section):
     augment: AugmentConfig = AugmentConfig()
     upright: bool = Field(
         False,
-        description="views are turned upright by their gravity, which a place's gravity.txt or lines in "
-        "the image tell",
+        description="rotate views upright by their gravity, taken from a place's gravity.txt or estimated "
+        "from lines in the image",
     )
 
     @model_validator(mode="after")
@@ -110,23 +108,21 @@ class ViewConfig(_Section):
 class HeadConfig(_Section):
     """Shape of the head."""
 
-    taps: tuple[int, ...] = Field((5, 8, 11), min_length=1, description="backbone blocks it reads")
+    taps: tuple[int, ...] = Field((5, 8, 11), min_length=1, description="backbone blocks the head reads")
     dim: int = Field(128, ge=8, le=512, description="channels at token resolution")
     blocks: int = Field(1, ge=0, le=8, description="residual convolutions at token resolution")
-    guide_dim: int = Field(64, ge=4, le=256, description="channels that carry image edges to the upsampling")
+    guide_dim: int = Field(64, ge=4, le=256, description="channels of the image guide of the upsampling")
     dropout: float = Field(0.2, ge=0, lt=1, description="share of token channels dropped in training")
-    level_dim: int = Field(
-        0, ge=0, le=256, description="channels of a branch that tells a view's scale apart from its relief; "
-        "0: both are told by the same layers",
-    )  # fmt: skip
-    gravity: bool = Field(False, description="the head is told where down is")
-    unknown_gravity: float = Field(
-        0.1, ge=0, le=1, description="share of training samples for which the head is not told"
+    scale_dim: int = Field(
+        0, ge=0, le=256, description="channels of the scale branch; 0: scale and shape share all layers"
     )
-    down_dim: int = Field(
-        0, ge=0, le=256, description="channels of a network that finds out which way is down; 0: there is "
-        "none, and the head is never told",
-    )  # fmt: skip
+    gravity: bool = Field(False, description="the head takes the direction of gravity as input")
+    unknown_gravity: float = Field(
+        0.1, ge=0, le=1, description="share of training samples whose gravity is hidden from the head"
+    )
+    gravity_dim: int = Field(
+        0, ge=0, le=256, description="channels of the network that estimates gravity; 0: no such network"
+    )
 
     @field_validator("taps")
     @classmethod
@@ -139,13 +135,13 @@ class HeadConfig(_Section):
 
     @model_validator(mode="after")
     def _gravity_has_its_branch(self) -> HeadConfig:
-        if self.gravity and not self.level_dim:
-            raise ValueError("gravity needs a level_dim above 0")
+        if self.gravity and not self.scale_dim:
+            raise ValueError("gravity needs a scale_dim above 0")
         return self
 
 
 class LossConfig(_Section):
-    """Weights of the terms of the loss."""
+    """Weights of the loss terms."""
 
     nll: float = Field(1.0, ge=0, description="Laplace likelihood of log depth with its uncertainty")
     scale_invariant: float = Field(1.0, ge=0, description="variance-reduced squared log error")
@@ -154,11 +150,11 @@ class LossConfig(_Section):
 
 
 class SearchRange(_Section):
-    """Where ``--search`` looks for one setting: between ``low`` and ``high``, or among ``choices``."""
+    """Search space of one setting: from ``low`` to ``high``, or one of ``choices``."""
 
     low: float | None = None
     high: float | None = None
-    log: bool = Field(False, description="spread evenly over magnitudes")
+    log: bool = Field(False, description="sample uniformly in the logarithm")
     choices: tuple[float, ...] | None = Field(None, min_length=1)
 
     @model_validator(mode="after")
@@ -175,28 +171,31 @@ class SearchRange(_Section):
 
 
 class TrainConfig(_Section):
-    """One training run."""
+    """Settings of one training run."""
 
     seed: int = Field(0, ge=0)
     members: int = Field(1, ge=1, le=16, description="heads trained from different seeds and averaged")
-    coarse_epochs: int = Field(10, ge=0, description="epochs judged at 1/7 resolution, before the upsampling")
+    coarse_epochs: int = Field(
+        10, ge=0, description="epochs with the loss at 1/7 resolution, before upsampling"
+    )
     fine_epochs: int = Field(
-        1, ge=0, description="epochs at full resolution, after them, that train the upsampling alone"
+        1, ge=0, description="epochs at full resolution after them, which train the upsampling only"
     )
     batch: int = Field(16, ge=1)
     learning_rate: float = Field(
-        2e-3, gt=0, description="peak, in the coarse epochs and again in the fine ones"
+        2e-3, gt=0, description="peak rate, of the coarse epochs and again of the fine ones"
     )
     weight_decay: float = Field(0.05, ge=0)
     uncertainty: Literal["own", "out_of_fold"] = Field(
-        "own", description="each member's own, or that together with what errors in places left out teach"
+        "own", description="each member's own, or that combined with one fitted to errors in left-out places"
     )
     sigma_scale: float = Field(
-        1.0, gt=0,
-        description="calibration of sigma; measured instead where there are held-out places or out_of_fold",
-    )  # fmt: skip
-    backbone: str | None = Field(None, description="weights file; the cached one if absent")
-    trained_on: str = Field("", description="said of the head wherever it is used; its places if empty")
+        1.0, gt=0, description="calibration of sigma; measured where there are held-out places or out_of_fold"
+    )
+    backbone: str | None = Field(None, description="weights file; the cached backbone if absent")
+    trained_on: str = Field(
+        "", description="training data as shown wherever the head is used; its places if empty"
+    )
     licence: str = Field("unknown", description="licence of the head")
     output: str = Field(description="file the head is written to")
     sources: tuple[SourceConfig, ...] = Field(min_length=1)
@@ -204,22 +203,22 @@ class TrainConfig(_Section):
     head: HeadConfig = HeadConfig()
     loss: LossConfig = LossConfig()
     search: dict[str, SearchRange] = Field(
-        {}, description="settings that --search tunes, by their dotted name, such as head.dim"
+        {}, description="settings tuned by --search, by dotted name, such as head.dim"
     )
 
     @field_validator("fine_epochs")
     @classmethod
     def _trains_at_all(cls, fine_epochs: int, info: ValidationInfo) -> int:
         if fine_epochs == 0 and info.data.get("coarse_epochs") == 0:
-            raise ValueError("there must be an epoch at least, and coarse_epochs is 0 too")
+            raise ValueError("at least one epoch is needed, and coarse_epochs is 0 too")
         return fine_epochs
 
     @field_validator("head")
     @classmethod
     def _knows_gravity(cls, head: HeadConfig, info: ValidationInfo) -> HeadConfig:
         view = info.data.get("view")
-        if (head.gravity or head.down_dim) and view is not None and not view.upright:
-            raise ValueError("gravity and down_dim need 'view: {upright: true}', which finds gravity out")
+        if (head.gravity or head.gravity_dim) and view is not None and not view.upright:
+            raise ValueError("gravity and gravity_dim need 'view: {upright: true}', which determines gravity")
         return head
 
     @field_validator("search")
@@ -240,16 +239,16 @@ class TrainConfig(_Section):
             for member in source.members or ():
                 if count is not None and not 0 <= member < count:
                     there_are = f"there are members 0 to {count - 1}"
-                    raise ValueError(f"'{source.folder}' is to teach member {member}, and {there_are}")
+                    raise ValueError(f"'{source.folder}' names member {member}, and {there_are}")
         return sources
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> TrainConfig:
-        """Read and validate ``path``.
+        """Read and validate the YAML file ``path``.
 
         Raises:
             ConfigError: the file cannot be read, or a setting is unknown, missing or out
-                of range; names it.
+                of range. The message names it.
         """
         path = Path(path)
         try:
@@ -265,7 +264,7 @@ class TrainConfig(_Section):
         """Validate nested ``values``; ``origin`` is named in errors.
 
         Raises:
-            ConfigError: a setting is unknown, missing or out of range; names it.
+            ConfigError: a setting is unknown, missing or out of range. The message names it.
         """
         try:
             return cls.model_validate(values)
@@ -282,16 +281,16 @@ def _numbers(section: type[BaseModel], prefix: str = "", left_out: tuple[str, ..
     return {prefix + key: kind is int for key, kind in kinds.items() if kind in (int, float)}
 
 
-# What decides on the features, the places or the size of the file is not for a search.
+# Excluded: settings that change the features, the places or the size of the file.
 SEARCHABLE: dict[str, bool] = {
     **_numbers(TrainConfig, left_out=("seed", "members", "sigma_scale")),
-    **_numbers(HeadConfig, "head.", left_out=("down_dim",)),
+    **_numbers(HeadConfig, "head.", left_out=("gravity_dim",)),
     **_numbers(LossConfig, "loss."),
 }
-"""Settings that can be searched, by dotted name; True where they are whole numbers."""
+"""Searchable settings by dotted name; True for whole numbers."""
 
 
 def digest(section: BaseModel, *more: object) -> str:
-    """Short hash of settings (and more), which names caches and checkpoints made with them."""
+    """Short hash of settings and further items; names the caches and checkpoints made with them."""
     text = json.dumps([section.model_dump(mode="json"), [str(item) for item in more]], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

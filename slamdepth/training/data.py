@@ -1,28 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where training images with depth come from: places, and the readers that open them.
+"""Places, the sources of training images with depth, and the readers that open them.
 
-A reader is one file in ``slamdepth/training/readers/`` with a class under
-``@register_reader``. Whoever starts a training may hand in more of them; that is how
-the sequence layouts of ``slamdepth.datasets``, which this room does not know, get here.
+A reader is one file in ``slamdepth/training/readers/`` with a class under ``@register_reader``.
+The caller of a training may pass further readers; the pipeline passes those of the sequence
+layouts in ``slamdepth.datasets``.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib
 import logging
 import os
-import pkgutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 from slamdepth.errors import DatasetError
+from slamdepth.registry import Registry
 from slamdepth.types import Camera, Frame
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+from slamdepth.typing import Floats
 
 logger = logging.getLogger(__name__)
 
@@ -31,11 +27,11 @@ class Place(Protocol):
     """Images with depth taken by one camera, read one at a time.
 
     Attributes:
-        name: short name; the views made of it are random by seed and name.
+        name: short name; with the seed it determines the random views.
         camera: the camera of all its images.
-        notes: what was guessed, dropped or repaired while opening it, one line each.
-        benchmark: the benchmark a head trained on it has seen, or None.
-        fingerprint: differs where another file, size or camera would give other views.
+        notes: what was guessed, dropped or repaired on opening, one line each.
+        benchmark: the benchmark that a head trained on it has seen, or None.
+        fingerprint: hash of everything that determines its views: files, sizes, camera.
     """
 
     @property
@@ -59,9 +55,9 @@ class Place(Protocol):
         """
         ...
 
-    def down(self, index: int) -> NDArray[np.float64] | None:
-        """Unit direction of gravity ``(3,)`` in the camera's frame of image ``index``; None where the
-        place does not say."""
+    def gravity(self, index: int) -> Floats | None:
+        """Unit direction of gravity ``(3,)`` in the camera frame of image ``index``; None if the
+        place does not record it."""
         ...
 
 
@@ -69,8 +65,8 @@ class PlaceReader(Protocol):
     """Opens the folders of one layout.
 
     Attributes:
-        name: what a source's ``reader`` says.
-        needs: the files it needs, as a user should read them.
+        name: the value of a source's ``reader`` setting.
+        needs: the files it needs, worded for the user.
     """
 
     @property
@@ -79,7 +75,7 @@ class PlaceReader(Protocol):
     def needs(self) -> str: ...
 
     def matches(self, folder: Path) -> bool:
-        """True where ``folder`` is meant to have this layout, whole or not."""
+        """True if ``folder`` appears to have this layout, complete or not."""
         ...
 
     def open(self, folder: Path) -> Place:
@@ -92,25 +88,28 @@ class PlaceReader(Protocol):
 
 
 _ReaderType = TypeVar("_ReaderType", bound=PlaceReader)
-_readers: dict[str, PlaceReader] = {}
+READERS: Registry[PlaceReader] = Registry(
+    "reader of training data",
+    package="slamdepth.training.readers",
+    duplicate="two readers of training data are named '{name}'",
+    error=ValueError,
+)
 
 
 def register_reader(reader_type: type[_ReaderType]) -> type[_ReaderType]:
-    """Class decorator that makes a :class:`PlaceReader` known by its name."""
+    """Class decorator that registers a :class:`PlaceReader` under its name.
+
+    Raises:
+        ValueError: another reader has that name.
+    """
     reader = reader_type()
-    if reader.name in _readers:
-        raise ValueError(f"two readers of training data are named {reader.name!r}")
-    _readers[reader.name] = reader
+    READERS.add(reader.name, reader, reader_type)
     return reader_type
 
 
 def known_readers() -> dict[str, PlaceReader]:
-    """The readers of this room, by name."""
-    from slamdepth.training import readers
-
-    for module in pkgutil.iter_modules(readers.__path__):
-        importlib.import_module(f"{readers.__name__}.{module.name}")
-    return dict(sorted(_readers.items()))
+    """The readers of this package, by name."""
+    return {name: READERS.get(name) for name in READERS.names()}
 
 
 def open_place(
@@ -119,8 +118,8 @@ def open_place(
     """Open a folder of images with depth.
 
     Args:
-        reader: name of the reader; None takes the first whose layout the folder has.
-        more_readers: further readers, after those of this room.
+        reader: name of the reader; None takes the first that matches the folder.
+        more_readers: further readers, tried after those of this package.
 
     Raises:
         DatasetError: the folder is missing or of no known layout, there is no such
@@ -146,7 +145,7 @@ def open_place(
 
 
 def data_folder(named: str) -> Path:
-    """The folder as it is named or, where there is none, below ``$SLAMDEPTH_DATA``, should that be set.
+    """The folder ``named``, or that below ``$SLAMDEPTH_DATA`` if only that one exists.
 
     Environment variables and ``~`` are expanded.
 
@@ -164,7 +163,7 @@ def data_folder(named: str) -> Path:
 
 
 def fingerprint(paths: Iterable[Path], *more: object) -> str:
-    """Short hash of the names and sizes of files, and of ``more``.
+    """Short hash of the names and sizes of files and of ``more``.
 
     Raises:
         OSError: a file is gone.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Backbone features of augmented views, computed once and kept on disk.
+"""Backbone features of augmented views, computed once and cached on disk.
 
-The backbone is frozen, so a view's tokens never change; what a training costs is this
-cache. It grows by a few samples at a time and continues where a killed run stopped.
+The backbone is frozen, so the tokens of a view never change. Computing them is most of the cost of a
+training. The cache grows by a few samples at a time and resumes where a killed run stopped.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ import numpy as np
 
 from slamdepth.depth.gravity_field import gravity_field
 from slamdepth.depth.preprocess import CANONICAL_FOCAL_PX, normalised
-from slamdepth.training.config import Teaches, ViewConfig
+from slamdepth.training.config import Supervision, ViewConfig
 from slamdepth.training.data import Place
 from slamdepth.training.progress import Progress, TrainStep, silent
 from slamdepth.training.store import SampleStore, Spec, locked
 from slamdepth.training.views import Partner, SampleKey, canonical_depth, make_view
+from slamdepth.typing import Floats32, Ints
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,26 +44,26 @@ class FeatureCache:
         canonical_m: ``(N, rows, columns)`` float16, depth at the canonical focal
             length, 0 unknown.
         focal_factor: ``(N,)`` float32; metres per canonical metre.
-        down: ``(N, 3)`` float32, unit direction of gravity in the view's camera frame; zeros unknown.
+        gravity: ``(N, 3)`` float32, unit direction of gravity in the view's camera frame; zeros unknown.
         place: ``(N,)`` int, index into the places.
-        teaches: what is learnt from them.
+        supervision: what the samples supervise.
     """
 
     tokens: NDArray[np.float16]
     class_tokens: NDArray[np.float16]
     image_rgb: NDArray[np.uint8]
     canonical_m: NDArray[np.float16]
-    focal_factor: NDArray[np.float32]
-    down: NDArray[np.float32]
-    place: NDArray[np.int64]
-    teaches: Teaches = "both"
+    focal_factor: Floats32
+    gravity: Floats32
+    place: Ints
+    supervision: Supervision = "both"
 
     def __len__(self) -> int:
         return len(self.place)
 
 
 def sample_specs(config: ViewConfig, taps: tuple[int, ...], dim: int, patch: int) -> dict[str, Spec]:
-    """Shape and type of each array of one sample, for a backbone of ``dim`` channels."""
+    """Shape and type of each array of one sample, for a backbone of ``dim`` channels and ``patch`` pixels."""
     rows, columns = config.rows, config.columns
     return {
         "tokens": ((len(taps), dim, rows // patch, columns // patch), np.float16),
@@ -70,7 +71,7 @@ def sample_specs(config: ViewConfig, taps: tuple[int, ...], dim: int, patch: int
         "image_rgb": ((rows, columns, 3), np.uint8),
         "canonical_m": ((rows, columns), np.float16),
         "focal_factor": ((), np.float32),
-        "down": ((3,), np.float32),
+        "gravity": ((3,), np.float32),
     }
 
 
@@ -89,10 +90,11 @@ def build_cache(
     progress: Progress = silent,
     stage: str = "features",
 ) -> FeatureCache:
-    """Fill (or finish filling) the cache in ``folder`` and open it.
+    """Compute the missing samples of the cache in ``folder`` and open it.
 
     Args:
-        partners: what is mixed into the views.
+        batch: samples encoded at once.
+        partners: places that are mixed into the views.
 
     Raises:
         DatasetError: an image or its depth cannot be read.
@@ -113,7 +115,7 @@ def build_cache(
                 image_rgb=np.stack([view.image_rgb for view in views]),
                 canonical_m=np.stack([canonical_depth(view, config) for view in views]),
                 focal_factor=[view.focal_px / CANONICAL_FOCAL_PX for view in views],
-                down=np.stack([view.down for view in views]),
+                gravity=np.stack([view.gravity for view in views]),
             )
             progress(TrainStep(stage, count, len(groups)))
         store.commit()
@@ -121,14 +123,14 @@ def build_cache(
     place = np.array([key.place for key in keys], dtype=np.int64)
     return FeatureCache(
         arrays["tokens"], arrays["class_tokens"], arrays["image_rgb"], arrays["canonical_m"],
-        np.asarray(arrays["focal_factor"]), np.asarray(arrays["down"]), place,
+        np.asarray(arrays["focal_factor"]), np.asarray(arrays["gravity"]), place,
     )  # fmt: skip
 
 
 def encode(
     images_rgb: list[NDArray[np.uint8]], backbone: DinoV2, taps: tuple[int, ...], device: str
 ) -> tuple[NDArray[np.float16], NDArray[np.float16]]:
-    """Tokens ``(B, taps, dim, h, w)`` and class tokens ``(B, taps, dim)`` of images of one size."""
+    """Tokens ``(B, taps, dim, h, w)`` and class tokens ``(B, taps, dim)`` of ``images_rgb`` of one size."""
     import torch
 
     with torch.inference_mode():
@@ -140,7 +142,7 @@ def encode(
 
 
 def load_batch(
-    cache: FeatureCache, chosen: NDArray[np.int64], device: str
+    cache: FeatureCache, chosen: Ints, device: str
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Tokens, class tokens, normalised images, gravity fields and canonical depth of the samples
     ``chosen (B,)``."""
@@ -152,23 +154,30 @@ def load_batch(
         torch.from_numpy(cache.tokens[chosen]).to(device).float(),
         torch.from_numpy(cache.class_tokens[chosen]).to(device).float(),
         normalised(cache.image_rgb[chosen], device),
-        gravity_field(torch.from_numpy(cache.down[chosen]), focal_px, rows, columns).to(device),
+        gravity_field(torch.from_numpy(cache.gravity[chosen]), focal_px, rows, columns).to(device),
         torch.from_numpy(cache.canonical_m[chosen]).to(device).float(),
     )
 
 
 def load_mixed_batch(
-    caches: Sequence[FeatureCache], chosen: NDArray[np.int64], device: str
+    caches: Sequence[FeatureCache], chosen: Ints, device: str
 ) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]:
-    """The samples ``chosen (B, 2)``, each a cache and a sample of it, as :func:`load_batch` gives them,
-    sorted by cache; and ``(B, 2)`` whether each teaches relief, and level."""
+    """A batch of samples from several caches.
+
+    Args:
+        chosen: ``(B, 2)``, cache and sample index of each.
+
+    Returns:
+        The batch as from :func:`load_batch`, sorted by cache; and ``(B, 2)`` of 0 and 1, whether each
+        sample supervises shape and scale.
+    """
     import torch
 
     present = np.unique(chosen[:, 0])
     each = [np.sort(chosen[chosen[:, 0] == c, 1]) for c in present]
     parts = [load_batch(caches[c], some, device) for c, some in zip(present, each, strict=True)]
-    taught = [[caches[c].teaches in (one, "both") for one in ("relief", "level")] for c in present]
+    of_cache = [[caches[c].supervision in (branch, "both") for branch in ("shape", "scale")] for c in present]
     repeats = torch.tensor([len(some) for some in each])
-    teaches = torch.tensor(taught, dtype=torch.float32).repeat_interleave(repeats, dim=0)
+    supervision = torch.tensor(of_cache, dtype=torch.float32).repeat_interleave(repeats, dim=0)
     tokens, class_tokens, image, field, depth = (torch.cat(part) for part in zip(*parts, strict=True))
-    return (tokens, class_tokens, image, field, depth), teaches.to(device)
+    return (tokens, class_tokens, image, field, depth), supervision.to(device)

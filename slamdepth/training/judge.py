@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good a head is on views it was not trained on, and a few of its predictions to look at."""
+"""Evaluation of a head on held-out views, and sample predictions for the report."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,21 +15,18 @@ from slamdepth.training.features import FeatureCache, load_batch
 from slamdepth.training.losses import total_loss
 from slamdepth.training.results import SampleView
 from slamdepth.training.stages import predict
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from slamdepth.typing import Floats
 
 _BATCH = 10
-_FEWEST_PIXELS = 100
+_MIN_PIXELS = 100
 
 
-def judge(
-    ensemble: HeadEnsemble, cache: FeatureCache, device: str
-) -> tuple[dict[str, float], NDArray[np.float64]]:
-    """Figures over the samples of ``cache``, and all ``|log error| / sigma``.
+def judge(ensemble: HeadEnsemble, cache: FeatureCache, device: str) -> tuple[dict[str, float], Floats]:
+    """Depth figures over the samples of ``cache``, and ``|log error| / sigma`` of all their pixels.
 
-    AbsRel as predicted and after a median per view, delta1 after it, the spread of the
-    views' log scales, and the share of errors below one sigma.
+    The figures are AbsRel as predicted and after median scaling per view, delta1 after that, the
+    standard deviation of the views' log scales, and the share of errors below one sigma. They are
+    empty if no view has enough known depth.
     """
     rows: list[list[float]] = []
     ratios = []
@@ -39,7 +35,7 @@ def judge(
         with torch.inference_mode():
             log_depth, sigma = ensemble(*batch[:4])
         known = batch[4][0] > 0
-        if int(known.sum()) < _FEWEST_PIXELS:
+        if int(known.sum()) < _MIN_PIXELS:
             continue
         error = (log_depth[0][known] - batch[4][0][known].log()).double().cpu().numpy()
         ratios.append(np.abs(error) / sigma[0][known].double().cpu().numpy())
@@ -67,8 +63,10 @@ def judge(
 def held_out_figures(
     head: DepthHead, caches: Sequence[FeatureCache], config: LossConfig, is_fine: bool, device: str
 ) -> tuple[float, float]:
-    """Loss, and AbsRel after one median a view, of one member at the resolution of its stage;
-    means over the views of a place, then over places."""
+    """Loss and AbsRel after median scaling per view of one member, at the resolution of its stage.
+
+    Both are means over the views of a place, then over places.
+    """
     was_training = head.training
     head.eval()
     losses, errors = [], []
@@ -94,12 +92,14 @@ def sample_views(
     ensemble: HeadEnsemble, planned: Sequence[PlannedCache], caches: Sequence[FeatureCache], count: int,
     device: str,
 ) -> tuple[SampleView, ...]:  # fmt: skip
-    """At most ``count`` views with their prediction: a third from training (all where nothing is
-    held out), each from another place as long as there are any."""
+    """At most ``count`` views with their prediction, from as many different places as possible.
+
+    A third is from training places, or all if nothing is held out.
+    """
     both = list(zip(planned, caches, strict=True))
-    judged = [(p, c) for p, c in both if p.held_out is not None]
+    held_out = [(p, c) for p, c in both if p.held_out is not None]
     trained = [(p, c) for p, c in both if p.held_out is None]
-    chosen = _spread(judged, count - count // 3 if trained else count)
+    chosen = _spread(held_out, count - count // 3 if trained else count)
     chosen += _spread(trained, count - len(chosen))
     return tuple(_sample_view(ensemble, p, c, k, device) for p, c, k in chosen)
 
@@ -107,7 +107,7 @@ def sample_views(
 def _spread(
     sources: list[tuple[PlannedCache, FeatureCache]], count: int
 ) -> list[tuple[PlannedCache, FeatureCache, int]]:
-    """Samples of every place in turn, those of a place evenly spaced."""
+    """Samples of each place in turn, evenly spaced within a place."""
     by_place = [
         (planned, cache, np.flatnonzero(cache.place == place))
         for planned, cache in sources

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether there is anything to learn depth from."""
+"""Check that there are views with known depth to train on."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from slamdepth.errors import DatasetError
 from slamdepth.training.caches import PlannedCache, of_member
 from slamdepth.training.config import TrainConfig
 from slamdepth.training.features import FeatureCache
+from slamdepth.typing import Ints
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from slamdepth.training.out_of_fold import Fold
 
 logger = logging.getLogger(__name__)
@@ -28,29 +27,29 @@ def check_known_depth(
     caches: Sequence[FeatureCache],
     folds: Sequence[Fold],
 ) -> None:
-    """See that each head has a view with known depth to learn from; places that have none are logged.
+    """Check that each head has a training view with known depth; log the places that have none.
 
     Raises:
-        DatasetError: a head has none.
+        DatasetError: a head has no such view.
     """
     bounds = f"between {config.view.min_depth_m:g} and {config.view.max_depth_m:g} m"
     for plan, cache in zip(planned, caches, strict=True):
-        for number, place in enumerate(plan.places if plan.teaches != "down" else ()):
+        for number, place in enumerate(plan.places if plan.supervision != "gravity" else ()):
             if not _any_known([(cache, np.flatnonzero(cache.place == number))]):
                 logger.warning("%s: no view of it has depth %s", place.name, bounds)
-    learnt = [
+    training = [
         [(cache, np.arange(len(cache))) for cache in of_member(planned, caches, member)]
         for member in range(config.members)
     ]
-    learnt += [list(zip(caches, fold.learnt, strict=True)) for fold in folds]
-    if not all(map(_any_known, learnt)):
+    training += [list(zip(caches, fold.training, strict=True)) for fold in folds]
+    if not all(map(_any_known, training)):
         named = {place.name for plan in planned if plan.held_out is None for place in plan.places}
         raise DatasetError(
-            f"{', '.join(sorted(named))}: no view that a head is to learn from has depth {bounds}; look at "
+            f"{', '.join(sorted(named))}: no view that a head is to be trained on has depth {bounds}; check "
             "the depth images and their unit, or set view.min_depth_m and view.max_depth_m"
         )
 
 
-def _any_known(views: Iterable[tuple[FeatureCache, NDArray[np.int64]]]) -> bool:
-    """True where one of the samples ``(n,)`` of a cache has known depth; looks no further than that."""
+def _any_known(views: Iterable[tuple[FeatureCache, Ints]]) -> bool:
+    """True if any of the samples ``(n,)`` of a cache has known depth."""
     return any(bool((cache.canonical_m[k] > 0).any()) for cache, samples in views for k in samples)

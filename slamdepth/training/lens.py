@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a ray meets the raw image of a camera with lens distortion."""
+"""Projection of rays into the raw image of a camera with lens distortion."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
 _STEEPEST = 4.0
-"""Slope of the steepest ray looked at: 76 degrees off the axis."""
+"""Largest slope considered: 76 degrees off the optical axis."""
 
 
 def raw_pixels(rays: Floats, camera: Camera) -> Floats:
-    """Pixels ``(..., 2)`` of the raw image that rays ``(..., 3)`` with z > 0 come from.
+    """Raw pixels ``(..., 2)`` of the rays ``(..., 3)`` with z > 0.
 
-    A distortion polynomial is made for the image; far outside it bends back and would show
-    the image a second time. Rays beyond that turning point go where a lens without
-    distortion sends them, which is outside the image too.
+    A distortion polynomial is fitted inside the image; far outside, it folds back and would show
+    the image a second time. Rays beyond that turning point are projected without distortion,
+    which puts them outside the image too.
     """
     plane = rays[..., :2] / rays[..., 2:]
     pinhole = plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
@@ -26,14 +26,13 @@ def raw_pixels(rays: Floats, camera: Camera) -> Floats:
     import cv2
 
     flat = np.ascontiguousarray(np.concatenate([plane.reshape(-1, 2), np.ones((plane.size // 2, 1))], axis=1))
-    bent, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), camera.K, camera.distortion_array)
-    is_sane = np.linalg.norm(plane, axis=-1) < turning_point(camera)
-    return np.where(is_sane[..., None], np.asarray(bent).reshape(plane.shape), pinhole)
+    distorted, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), camera.K, camera.distortion_array)
+    is_valid = np.linalg.norm(plane, axis=-1) < turning_point(camera)
+    return np.where(is_valid[..., None], np.asarray(distorted).reshape(plane.shape), pinhole)
 
 
 def turning_point(camera: Camera) -> float:
-    """The slope of a ray from which on the radial distortion of ``camera`` bends back; infinity
-    where it does not."""
+    """The ray slope beyond which the radial distortion of ``camera`` folds back; infinity if never."""
     k1, k2, _, _, k3 = camera.distortion
     r2 = np.linspace(0.0, _STEEPEST, 4001) ** 2
     slope = 1.0 + 3.0 * k1 * r2 + 5.0 * k2 * r2**2 + 7.0 * k3 * r2**3

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Losses on log depth. Every term is a mean over each image's known pixels, then over images."""
+"""Losses on log depth. Each term is a mean over an image's known pixels, then over images."""
 
 from __future__ import annotations
 
@@ -12,34 +12,32 @@ _GRADIENT_STEPS = (1, 2, 4, 8, 16)
 _LOG_SPREAD_RANGE = (-4.0, 1.5)
 
 
-def taught(prediction: Tensor, target_m: Tensor, teaches: Tensor) -> Tensor:
-    """``prediction`` with what its samples do not teach cut off from the gradient.
+def supervised(prediction: Tensor, target_m: Tensor, supervision: Tensor) -> Tensor:
+    """``prediction`` with the gradient stopped for what its samples do not supervise.
 
-    The level of a sample is its mean log depth, its relief the rest. Where the level is not taught, the
-    mean error over known pixels is taken out too, so that the sample's scale costs nothing.
+    The scale of a sample is its mean log depth, its shape the rest. Without supervision of the scale
+    the mean error over known pixels is subtracted too, so a wrong scale adds nothing to the loss.
 
     Args:
         prediction: ``(B, 2, H, W)`` log depth and log Laplace spread, as for :func:`total_loss`.
         target_m: ``(B, H, W)`` depth, 0 where unknown.
-        teaches: ``(B, 2)`` of 0 and 1: relief, level.
+        supervision: ``(B, 2)`` of 0 and 1: shape, scale.
     """
-    if bool((teaches > 0).all()):
+    if bool((supervision > 0).all()):
         return prediction
-    has_relief, has_level = (teaches > 0)[:, :, None, None].unbind(dim=1)
+    has_shape, has_scale = (supervision > 0)[:, :, None, None].unbind(dim=1)
     log_depth = prediction[:, 0]
-    level = log_depth.mean(dim=(1, 2), keepdim=True)
-    relief = log_depth - level
-    log_depth = torch.where(has_relief, relief, relief.detach()) + torch.where(
-        has_level, level, level.detach()
-    )
+    scale = log_depth.mean(dim=(1, 2), keepdim=True)
+    shape = log_depth - scale
+    log_depth = torch.where(has_shape, shape, shape.detach()) + torch.where(has_scale, scale, scale.detach())
     known = target_m > 0
     error = torch.where(known, log_depth - target_m.clamp_min(1e-3).log(), 0.0)
     mean = error.sum(dim=(1, 2), keepdim=True) / known.sum(dim=(1, 2), keepdim=True).clamp_min(1)
-    return torch.stack([log_depth - torch.where(has_level, 0.0, mean), prediction[:, 1]], dim=1)
+    return torch.stack([log_depth - torch.where(has_scale, 0.0, mean), prediction[:, 1]], dim=1)
 
 
 def total_loss(prediction: Tensor, target_m: Tensor, config: LossConfig) -> Tensor:
-    """Weighted sum of the terms.
+    """Weighted sum of the loss terms.
 
     Args:
         prediction: ``(B, 2, H, W)`` log depth and log Laplace spread.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training of the dissertation's network: three fully connected layers over all DINOv2 tokens.
 
-Loss MSE * exp(1 - SSIM), Adam at 1e-4, no augmentation, images squeezed to 224 x 224. Depth is
-taken to one focal length, so that places seen by different cameras agree. The same training
-without the ViT, on the pixels themselves, is the dissertation's ablation.
+Loss MSE * exp(1 - SSIM), Adam at 1e-4, no augmentation, images resized to 224 x 224 without keeping
+their aspect. Depth is normalised to one focal length, so that places seen by different cameras agree.
+The same training without the ViT, on the pixels themselves, is the dissertation's ablation.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ _ENCODED_AT_ONCE = 8
 
 @dataclass(frozen=True)
 class MlpSettings:
-    """One training; the defaults are the dissertation's but for the epochs, which were 500.
+    """Settings of one training. The defaults are the dissertation's except for its 500 epochs.
 
     Attributes:
         output: side of the depth map, 32 or 224.
         hidden: width of the two inner layers.
-        min_m, max_m: sensor depths outside are not learnt from.
+        min_m, max_m: range of the sensor depths trained on.
     """
 
     output: int = 32
@@ -59,12 +59,12 @@ class MlpSettings:
 
 @dataclass(frozen=True)
 class MlpPairs:
-    """Images and depth of one or more places, squeezed to 224 x 224.
+    """Images and depth of one or more places, resized to 224 x 224.
 
     Attributes:
         image_rgb: ``(N, 224, 224, 3)`` uint8.
-        depth_m: ``(N, 224, 224)`` float32 metres as the camera of the place saw them, 0 unknown.
-        focal_px: ``(N,)`` focal length of each squeezed image, geometric mean of both axes.
+        depth_m: ``(N, 224, 224)`` float32 metres for the camera of the place, 0 unknown.
+        focal_px: ``(N,)`` focal length of each resized image, geometric mean of both axes.
     """
 
     image_rgb: NDArray[np.uint8]
@@ -75,13 +75,13 @@ class MlpPairs:
         return len(self.image_rgb)
 
     def depth_at(self, focal_px: float) -> NDArray[np.float32]:
-        """``depth_m`` as it would be learnt at another focal length in pixels."""
+        """``depth_m`` normalised to a focal length of ``focal_px`` pixels."""
         factor = (focal_px / self.focal_px).astype(np.float32)
         return self.depth_m * factor[:, None, None]
 
 
 def read_pairs(places: Sequence[Place]) -> MlpPairs:
-    """All pairs of ``places``; depth is resized without mixing near and far.
+    """All pairs of ``places``; depth is resized by nearest neighbour.
 
     Raises:
         DatasetError: a file does not decode.
@@ -107,7 +107,7 @@ def cached_tokens(
     device: str = "cpu",
     progress: Progress = silent,
 ) -> NDArray[np.float16]:
-    """Class and patch tokens ``(N, 257 * dim)`` of every image of ``place``, kept in the cache folder."""
+    """Class and patch tokens ``(N, 257 * dim)`` of every image of ``place``, from the cache if there."""
     key = fingerprint((), backbone_sha256, place.fingerprint)
     file = store.cache_dir() / "features" / f"mlp-{place.name}-{key}.npy"
     if not file.is_file():
@@ -135,17 +135,17 @@ def train_mlp(
     device: str = "cpu",
     progress: Progress = silent,
 ) -> tuple[MlpHead, list[float]]:
-    """Train one head; the same for the same seed on the same machine.
+    """Train one head. The result is the same for the same seed on the same machine.
 
     Args:
-        features: ``(N, F)`` numbers of each image.
+        features: ``(N, F)``, the input of each image.
         depth_m: ``(N, 224, 224)`` metres at one focal length, 0 where unknown.
 
     Returns:
         The head in eval mode, and the mean loss of each epoch.
 
     Raises:
-        ConfigError: the loss is not finite any more; the learning rate is too large.
+        ConfigError: the loss has become infinite or NaN; the learning rate is too large.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
@@ -167,7 +167,7 @@ def train_mlp(
             x = torch.from_numpy(np.asarray(features[chosen], dtype=np.float32)).to(device)
             loss = mse_ssim_loss(head(x), target[chosen].to(device))
             optimiser.zero_grad(set_to_none=True)
-            loss.backward()
+            torch.autograd.backward(loss)
             optimiser.step()
             total += float(loss.detach())
         losses.append(total / len(starts))
@@ -192,11 +192,12 @@ def mse_ssim_loss(predicted_m: Tensor, target_m: Tensor) -> Tensor:
     data_range = target_m.amax(dim=(1, 2), keepdim=True).clamp_min(1e-3)
     similar = ssim_map(predicted_m, target_m, weight, _blur, data_range)
     ssim = (similar * weight).sum(dim=(1, 2)) / count
-    return (mse * (1.0 - ssim).exp()).mean()
+    loss: Tensor = (mse * (1.0 - ssim).exp()).mean()
+    return loss
 
 
 def shrink(depth_m: Tensor, side: int) -> Tensor:
-    """``(N, 224, 224)`` at ``(N, side, side)``: the mean of each block's known pixels, 0 where none is."""
+    """``depth_m (N, 224, 224)`` as ``(N, side, side)``: the mean of each block's known pixels, else 0."""
     if depth_m.shape[-1] == side:
         return depth_m
     step = depth_m.shape[-1] // side

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertainty learnt from errors in places that the predicting head has not seen.
+"""Uncertainty fitted to errors in places that the predicting head was not trained on.
 
-Every place is left out once, a third of them at a time: a head learns from the others, predicts views of
-those left out that are not mixed, and what it gets wrong there, after the view's median is taken out, is
-what a :class:`~slamdepth.depth.uncertainty.UncertaintyNet` learns to foresee.
-How wrong a whole view is is divided out,
-so that it learns which pixels of a view are surer than others. (What was mixed into a view that a head
-learns from may be of a place left out.)
+Each place is left out once, a third of them at a time (cross-validation). A head is trained on the other
+places and predicts the unmixed views of those left out. The uncertainty
+(:mod:`slamdepth.depth.uncertainty`) is fitted to its errors there, after median scaling per view. Errors
+are divided by the mean error of their view, so the fit learns which pixels of a view are more certain
+than others. A view mixed into a training view may come from a left-out place.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from slamdepth.depth.head import DepthHead
@@ -28,14 +26,15 @@ from slamdepth.training.caches import PlannedCache
 from slamdepth.training.features import FeatureCache, load_batch
 from slamdepth.training.progress import Progress, TrainStep
 from slamdepth.training.stages import coarse_target
+from slamdepth.typing import Ints
 
 logger = logging.getLogger(__name__)
 
 COMPONENTS = 16
 _FOLDS = 3
 PIXELS = 96
-"""Of a view, that a doubt learns from."""
-_FEWEST = 20
+"""Number of pixels of a view that the uncertainty is fitted to."""
+_MIN_PIXELS = 20
 _VIEWS_AT_ONCE = 10
 _STEPS, _BATCH, _RATE, _DECAY = 300, 2048, 3e-3, 0.3
 _ONE_SIGMA = 0.6827
@@ -43,23 +42,27 @@ _ONE_SIGMA = 0.6827
 
 @dataclass(frozen=True)
 class Fold:
-    """Samples of each planned cache, ``(n,)`` indices, that a head learns from, and that it is tried on."""
+    """One split of the samples of all planned caches.
 
-    learnt: tuple[NDArray[np.int64], ...]
-    left_out: tuple[NDArray[np.int64], ...]
+    Attributes:
+        training: for each cache, the ``(n,)`` samples that the head of this fold is trained on.
+        left_out: for each cache, the ``(n,)`` samples that it is evaluated on.
+    """
+
+    training: tuple[Ints, ...]
+    left_out: tuple[Ints, ...]
 
 
 def plan_folds(planned: Sequence[PlannedCache]) -> list[Fold]:
-    """Each place that has views that are not mixed left out once, in all that is made of it.
+    """Splits in which each place with unmixed views is left out once, with all of its samples.
 
     Raises:
-        ConfigError: there are not two such places.
+        ConfigError: there are fewer than two such places.
     """
-    teaching = [plan.held_out is None and plan.teaches != "down" for plan in planned]
-    plain = [is_one and not plan.view.augment.mixed for plan, is_one in zip(planned, teaching, strict=True)]
+    is_unmixed = [plan.trains_depth and not plan.view.augment.mixed for plan in planned]
     fold_of: dict[str, int] = {}
-    for plan, is_one in zip(planned, plain, strict=True):
-        for place in plan.places if is_one else ():
+    for plan, unmixed in zip(planned, is_unmixed, strict=True):
+        for place in plan.places if unmixed else ():
             fold_of.setdefault(place.fingerprint, len(fold_of) % _FOLDS)
     if len(fold_of) < 2:
         raise ConfigError(
@@ -68,28 +71,28 @@ def plan_folds(planned: Sequence[PlannedCache]) -> list[Fold]:
         )
     folds = []
     for fold in range(min(_FOLDS, len(fold_of))):
-        learnt, left_out = [], []
-        for plan, is_teaching, is_plain in zip(planned, teaching, plain, strict=True):
+        training, left_out = [], []
+        for plan, unmixed in zip(planned, is_unmixed, strict=True):
             of_place = [fold_of.get(place.fingerprint) == fold for place in plan.places]
             is_out = np.array([of_place[key.place] for key in plan.keys], dtype=bool)
-            learnt.append(np.flatnonzero(~is_out & is_teaching))
-            left_out.append(np.flatnonzero(is_out & is_plain))
-        folds.append(Fold(tuple(learnt), tuple(left_out)))
+            training.append(np.flatnonzero(~is_out & plan.trains_depth))
+            left_out.append(np.flatnonzero(is_out & unmixed))
+        folds.append(Fold(tuple(training), tuple(left_out)))
     return folds
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Pixels of views that the predicting head had not seen places of.
+    """Errors at pixels of left-out views.
 
     Attributes:
         tokens: ``(N, dim)`` float16, of the last tap.
-        features: ``(N, FEATURES)``.
-        error: ``(N,)`` size of the log error, after the view's median.
-        share: ``(N,)`` the same over the view's mean.
-        own: ``(N,)`` log spread that the predicting head tells itself.
-        place: ``(N,)`` counted over all that were left out.
-        view: ``(N,)``.
+        features: ``(N, FEATURES)``, see :func:`slamdepth.depth.uncertainty.features`.
+        error: ``(N,)`` absolute error of log depth after median scaling of the view.
+        share: ``(N,)`` that error over the mean error of its view.
+        own: ``(N,)`` log spread predicted by the head itself.
+        place: ``(N,)`` number of the place, over all caches.
+        view: ``(N,)`` number of the view.
     """
 
     tokens: Tensor
@@ -107,16 +110,20 @@ _FIELDS = tuple(Errors.__dataclass_fields__)
 def errors_of(
     head: DepthHead,
     cache: FeatureCache,
-    views: NDArray[np.int64],
+    views: Ints,
     numbers: Sequence[int],
     seed: Sequence[int],
     device: str,
 ) -> Errors | None:
-    """Up to ``PIXELS`` random pixels of each of ``views (n,)`` of ``cache`` at 1/7 of the resolution; None
-    where no view has enough depth.
+    """Errors at up to ``PIXELS`` random pixels of each view, at 1/7 resolution; None without enough depth.
 
     Args:
-        numbers: what the cache's places count as.
+        head: predicts depth.
+        cache: has the views.
+        views: ``(n,)`` samples of ``cache``.
+        numbers: number of each of the cache's places, see :class:`Errors`.
+        seed: of the random pixels.
+        device: where to compute.
     """
     rng = np.random.default_rng(list(seed))
     parts: list[tuple[Tensor, ...]] = []
@@ -129,7 +136,7 @@ def errors_of(
         read = features(log_depth, own, field[:, 0].cpu())
         for k, view in enumerate(chosen):
             known = torch.nonzero(target[k] > 0)
-            if len(known) < _FEWEST:
+            if len(known) < _MIN_PIXELS:
                 continue
             error = log_depth[k][target[k] > 0] - target[k][target[k] > 0].log()
             error = (error - error.median()).abs()
@@ -145,7 +152,7 @@ def errors_of(
 
 
 def join(parts: Sequence[Errors]) -> Errors:
-    """The errors of several caches and folds, their views counted on."""
+    """The errors of several caches and folds, with their views renumbered."""
     view = 0
     moved = []
     for part in parts:
@@ -154,74 +161,81 @@ def join(parts: Sequence[Errors]) -> Errors:
     return Errors(*(torch.cat([getattr(part, name) for part in moved]) for name in _FIELDS))
 
 
-def fit_doubt(
-    errors: Errors, seed: int, told: Callable[[int], None] = lambda _: None, *, steps: int | None = None
+def fit_uncertainty(
+    errors: Errors, seed: int, on_step: Callable[[int], None] = lambda _: None, *, steps: int | None = None
 ) -> UncertaintyNet:
-    """Learn log spread by Laplace likelihood (Kendall and Gal 2017) of the errors' shares in a
-    view's mean error, times the mean of all. Each place counts the same.
+    """Fit the log spread to ``errors`` by Laplace likelihood (Kendall and Gal 2017).
+
+    The error of a pixel is its share in the mean error of its view times the mean of all errors. Each
+    place counts the same.
 
     Args:
-        told: called with the number of steps done.
-        steps: how many; None: ``_STEPS``.
+        errors: errors in left-out places.
+        seed: of initialisation and batches.
+        on_step: called with the number of steps done.
+        steps: number of steps; None for the default.
     """
     steps = _STEPS if steps is None else steps
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        doubt = UncertaintyNet(errors.tokens.shape[1], min(COMPONENTS, errors.tokens.shape[1]))
+        network = UncertaintyNet(errors.tokens.shape[1], min(COMPONENTS, errors.tokens.shape[1]))
         tokens = errors.tokens.float()
-        doubt.centre.copy_(tokens.mean(dim=0))
+        network.centre.copy_(tokens.mean(dim=0))
         variance, axes = torch.linalg.eigh(torch.cov(tokens.T))
-        most = torch.arange(len(variance) - 1, len(variance) - 1 - len(doubt.basis), -1)
-        doubt.basis.copy_((axes[:, most] / variance[most].clamp_min(1e-6).sqrt()).T)
-        doubt.offset.copy_(errors.features.mean(dim=0))
-        doubt.gain.copy_(1 / errors.features.std(dim=0).clamp_min(1e-4))
-        read = read_by(doubt, errors)
+        largest = torch.arange(len(variance) - 1, len(variance) - 1 - len(network.basis), -1)
+        network.basis.copy_((axes[:, largest] / variance[largest].clamp_min(1e-6).sqrt()).T)
+        network.offset.copy_(errors.features.mean(dim=0))
+        network.gain.copy_(1 / errors.features.std(dim=0).clamp_min(1e-4))
+        inputs = network_inputs(network, errors)
         target = errors.share * errors.error.mean()
-        places = [torch.nonzero(errors.place == place)[:, 0] for place in errors.place.unique()]
-        optimiser = torch.optim.AdamW(doubt.parameters(), lr=_RATE, weight_decay=_DECAY)
+        places = [torch.nonzero(errors.place == place)[:, 0] for place in _distinct(errors.place)]
+        optimiser = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)
         for step in range(steps):
             for group in optimiser.param_groups:
                 group["lr"] = _RATE * (1 - step / steps)
             some = torch.cat([of[torch.randint(len(of), (_BATCH // len(places),))] for of in places])
-            spread = doubt.log_spread(read[some])
+            spread = network.log_spread(inputs[some])
             loss = (target[some] * (-spread).exp() + spread).mean()
             optimiser.zero_grad()
-            loss.backward()
+            torch.autograd.backward(loss)
             optimiser.step()
-            told(step + 1)
-    return doubt.eval().requires_grad_(False)
+            on_step(step + 1)
+    return network.eval().requires_grad_(False)
 
 
-def read_by(doubt: UncertaintyNet, errors: Errors) -> Tensor:
-    """What ``doubt`` reads of each pixel, ``(N, components + FEATURES)``."""
-    seen = (errors.tokens.float() - doubt.centre) @ doubt.basis.T
-    return torch.cat([seen, doubt.standardised(errors.features)], dim=1)
+def network_inputs(network: UncertaintyNet, errors: Errors) -> Tensor:
+    """Inputs ``(N, components + FEATURES)`` of ``network`` at each pixel."""
+    components = (errors.tokens.float() - network.centre) @ network.basis.T
+    return torch.cat([components, network.standardised(errors.features)], dim=1)
 
 
-def spread_of(doubt: UncertaintyNet, errors: Errors) -> Tensor:
-    """Log spread ``(N,)`` that a head with ``doubt`` tells of each pixel."""
-    return mean_log_spread(errors.own, doubt.log_spread(read_by(doubt, errors)))
+def spread_of(network: UncertaintyNet, errors: Errors) -> Tensor:
+    """Log spread ``(N,)`` of each pixel by a head combined with ``network``."""
+    return mean_log_spread(errors.own, network.log_spread(network_inputs(network, errors)))
 
 
-def sigma_scale(doubt: UncertaintyNet, errors: Errors) -> float:
-    """The factor that makes sigma cover 68 % of the errors after the view's median: the mean over
-    places, each of which counts the same."""
-    ratio = errors.error / (math.sqrt(2.0) * spread_of(doubt, errors).exp())
-    places = [ratio[errors.place == place] for place in errors.place.unique()]
+def sigma_scale(network: UncertaintyNet, errors: Errors) -> float:
+    """The factor on sigma with which 68 % of the errors after median scaling lie within one sigma.
+
+    It is the mean over places, so each place counts the same.
+    """
+    ratio = errors.error / (math.sqrt(2.0) * spread_of(network, errors).exp())
+    places = [ratio[errors.place == place] for place in _distinct(errors.place)]
     return float(np.mean([np.quantile(of_place.numpy(), _ONE_SIGMA) for of_place in places]))
 
 
-def surest_half(doubted_by: Tensor, errors: Errors) -> float:
-    """Mean over the views of the error of the surest half of their pixels over that of all.
+def surest_half(uncertainty: Tensor, errors: Errors) -> float:
+    """Mean error of the more certain half of the pixels over that of all pixels; mean over views.
 
     Args:
-        doubted_by: ``(N,)``, the larger the less sure.
+        uncertainty: ``(N,)``, larger means less certain; only its order within a view matters.
+        errors: errors at the same pixels.
     """
     found = []
-    for view in errors.view.unique():
+    for view in _distinct(errors.view):
         mine = errors.view == view
-        error, doubted = torch.expm1(errors.error[mine]), doubted_by[mine]
-        found.append(float(error[doubted <= doubted.median()].mean() / error.mean().clamp_min(1e-9)))
+        error, of_view = torch.expm1(errors.error[mine]), uncertainty[mine]
+        found.append(float(error[of_view <= of_view.median()].mean() / error.mean().clamp_min(1e-9)))
     return float(np.mean(found))
 
 
@@ -230,28 +244,33 @@ def of_places(errors: Errors, chosen: Tensor) -> Errors:
     return Errors(*(getattr(errors, name)[chosen] for name in _FIELDS))
 
 
-def learn_doubt(
+def learn_uncertainty(
     planned: Sequence[PlannedCache],
     caches: Sequence[FeatureCache],
     folds: Sequence[Fold],
-    train: Callable[[int, tuple[NDArray[np.int64], ...]], DepthHead],
+    train: Callable[[int, tuple[Ints, ...]], DepthHead],
     *,
     seed: int,
     device: str,
     progress: Progress,
 ) -> tuple[UncertaintyNet, float, dict[str, dict[str, float]]]:
-    """The whole way: heads without some places each, their errors there, the doubt learnt from all.
+    """Train the head of each fold, collect its errors in left-out places, and fit the uncertainty.
 
     Args:
-        train: makes the head of a fold, by number, from the samples of each cache.
+        planned, caches: all caches of the training.
+        folds: the splits of their samples.
+        train: trains the head of a fold, given its number and the samples of each cache.
+        seed: of the fits and of the chosen pixels.
+        device: where the heads compute.
+        progress: called with the progress of each stage.
 
     Returns:
-        The doubt, the factor on its sigma, and by place :func:`surest_half` by what a head says with a
-        doubt that has learnt nothing of that place (``out_of_fold``), by what a head that has not seen the
-        place says alone (``own``), and by how far a pixel's depth is from the median (``relief``).
+        The fitted network; the factor on its sigma; and :func:`surest_half` of each place by three
+        measures: ``out_of_fold``, the uncertainty fitted without that place; ``own``, that of the
+        head alone; ``depth_contrast``, the distance of a pixel's log depth from the view's median.
 
     Raises:
-        DatasetError: no view has enough depth to learn from.
+        DatasetError: no view has enough known depth.
     """
     parts = []
     names: list[str] = []
@@ -260,24 +279,30 @@ def learn_doubt(
         names += [place.name for place in plan.places if place.name not in names]
         numbers.append([names.index(place.name) for place in plan.places])
     for number, fold in enumerate(folds):
-        head = train(number, fold.learnt).eval()
+        head = train(number, fold.training).eval()
         for k, views in enumerate(fold.left_out):
             if (part := errors_of(head, caches[k], views, numbers[k], [seed, number, k], device)) is not None:
                 parts.append(part)
-        progress(TrainStep("errors in places left out", number + 1, len(folds)))
+        progress(TrainStep("errors in left-out places", number + 1, len(folds)))
     if not parts:
-        raise DatasetError("no view has enough depth to learn an uncertainty from")
+        raise DatasetError("no view has enough known depth to fit an uncertainty to")
     errors = join(parts)
-    doubt = fit_doubt(errors, seed, lambda step: progress(TrainStep("uncertainty", step, _STEPS)))
+    network = fit_uncertainty(errors, seed, lambda step: progress(TrainStep("uncertainty", step, _STEPS)))
     unseen: dict[str, dict[str, float]] = {}
-    for place in errors.place.unique().tolist():
+    places = _distinct(errors.place)
+    for place in places:
         mine = errors.place == place
-        without, there = fit_doubt(of_places(errors, ~mine), seed), of_places(errors, mine)
+        without, there = fit_uncertainty(of_places(errors, ~mine), seed), of_places(errors, mine)
         unseen[names[place]] = {
             "out_of_fold": surest_half(spread_of(without, there), there),
             "own": surest_half(there.own, there),
-            "relief": surest_half(there.features[:, 1], there),
+            "depth_contrast": surest_half(there.features[:, 1], there),
         }
-        logger.info("surest half in %s, not learnt from: %s", names[place], unseen[names[place]])
-        progress(TrainStep("uncertainty without a place", len(unseen), len(errors.place.unique())))
-    return doubt, sigma_scale(doubt, errors), unseen
+        logger.info("surest half in %s, not trained on: %s", names[place], unseen[names[place]])
+        progress(TrainStep("uncertainty without a place", len(unseen), len(places)))
+    return network, sigma_scale(network, errors), unseen
+
+
+def _distinct(numbers: Tensor) -> list[int]:
+    """The distinct values of ``numbers (N,)``, ascending."""
+    return [int(number) for number in np.unique(numbers.numpy())]

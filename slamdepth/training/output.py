@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a trained head goes, and whether it can go there; asked before anything is computed."""
+"""The output file of a training, checked before anything is computed."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from slamdepth.depth.head import FORMAT
 from slamdepth.depth.layout import unpack_about
 from slamdepth.errors import OutputError
+from slamdepth.io import writable
 from slamdepth.training.config import TrainConfig
 
 ENDING = ".safetensors"
 
 
 def output_path(config: TrainConfig) -> Path:
-    """The head's file, ``~`` expanded.
+    """The head file, with ``~`` expanded.
 
     Raises:
         OutputError: there is no such user.
@@ -27,9 +27,9 @@ def output_path(config: TrainConfig) -> Path:
 
 
 def check_output(config: TrainConfig) -> Path:
-    """:func:`output_path`, if a head can be written there; nothing is made yet.
+    """The head file, with ``~`` expanded, if a head can be written there; nothing is made yet.
 
-    A head that lies there may be replaced, no other file.
+    An existing head may be replaced, no other file.
 
     Raises:
         OutputError: it is a folder, has another ending, is a file but no head, or its folder
@@ -43,20 +43,14 @@ def check_output(config: TrainConfig) -> Path:
             raise OutputError(f"{path}: a head's file ends in {ENDING}; name one in setting 'output'")
         if path.exists() and not _is_head(path):
             raise OutputError(f"{path}: is there already and no depth head; name another file in 'output'")
-        folder = path.absolute().parent
-        while not folder.exists() and folder != folder.parent:
-            folder = folder.parent
-        if not folder.is_dir():
-            raise OutputError(f"{path}: cannot be written: {folder} is a file")
+        writable(path.parent if path.exists() else path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise OutputError(f"{path}: cannot be written: no permission to write to {folder}")
     return path
 
 
 def _is_head(path: Path) -> bool:
-    """By what the file says of itself, whichever version wrote it."""
+    """True if the header names a depth head of any format version."""
     from safetensors import SafetensorError, safe_open
 
     try:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training would take, told before it is begun."""
+"""The cost of a training, estimated before it starts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,28 +16,36 @@ from slamdepth.depth.head import DepthHead, HeadShape
 from slamdepth.depth.head_layers import FACTOR, GRAVITY_CHANNELS
 from slamdepth.depth.preprocess import PATCH
 from slamdepth.errors import WeightsError
-from slamdepth.training.caches import Encoder, benchmarks_seen, of_member, open_encoder, plan_caches
+from slamdepth.training.caches import (
+    Encoder,
+    PlannedCache,
+    benchmarks_seen,
+    of_member,
+    open_encoder,
+    plan_caches,
+)
 from slamdepth.training.config import TrainConfig
 from slamdepth.training.data import PlaceReader
 from slamdepth.training.features import encode, sample_specs
-from slamdepth.training.loop import head_shape, steps_per_epoch
 from slamdepth.training.losses import total_loss
-from slamdepth.training.out_of_fold import plan_folds
+from slamdepth.training.member import head_shape, steps_per_epoch
+from slamdepth.training.out_of_fold import Fold, plan_folds
 from slamdepth.training.output import check_output
 from slamdepth.training.stages import predict
-from slamdepth.training.store import bytes_per_sample, done_on_disk
-from slamdepth.training.timing import doubt_s, down_s, second_time
+from slamdepth.training.store import Spec, bytes_per_sample, done_on_disk
+from slamdepth.training.timing import gravity_s, second_time, uncertainty_s
 
 
 @dataclass(frozen=True)
 class PlannedSource:
-    """One line of a plan.
+    """One source of a plan.
 
     Attributes:
         places: names of its places.
-        images: images with depth in them.
-        samples, cached: views that are needed, and those of them on the disk already.
-        size_bytes: of all its views on the disk.
+        images: number of images with depth.
+        samples, cached: number of views needed, and of those already on disk.
+        size_bytes: size of all its views on disk.
+        folder: its feature cache.
     """
 
     places: tuple[str, ...]
@@ -51,15 +59,15 @@ class PlannedSource:
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """What a training would take.
+    """The cost of a training.
 
     Attributes:
-        steps: of the heads.
-        features_s, training_s: wall time, from a view and a step of each stage measured just now, with
-            what finds out which way is down and what learns uncertainty; None where the backbone is
-            missing.
-        missing: why it could not be measured.
-        benchmarks: benchmarks the head will have seen, each with the places of it.
+        sources: its feature caches.
+        steps: optimisation steps of all heads.
+        features_s, training_s: wall time, estimated from a view and a step of each stage; includes the
+            gravity network and the uncertainty. None if the backbone is missing.
+        missing: why the time could not be measured, else None.
+        benchmarks: benchmarks that the head will have seen, each with its places.
     """
 
     sources: tuple[PlannedSource, ...]
@@ -77,14 +85,17 @@ def plan_training(
     backbone: DinoV2 | None = None,
     readers: Mapping[str, PlaceReader] | None = None,
 ) -> TrainingPlan:
-    """Open the places of ``config``, count, and measure one batch of each kind; nothing is written.
+    """Open the places of ``config``, count samples, and time one batch of each kind; writes nothing.
 
     Args:
-        backbone: use this instead of the weights ``config`` names (for tests).
+        device: where to compute, such as "cpu" or "cuda".
+        backbone: use this instead of the weights named in ``config`` (for tests).
+        readers: further readers of places, in addition to those of :mod:`slamdepth.training.readers`.
 
     Raises:
-        ConfigError, DatasetError: as :func:`~slamdepth.training.caches.plan_caches`.
-        OutputError: as :func:`~slamdepth.training.output.check_output`.
+        ConfigError: see :func:`~slamdepth.training.caches.plan_caches`, or the device does not exist.
+        DatasetError: a place is missing or malformed.
+        OutputError: see :func:`~slamdepth.training.output.check_output`.
     """
     check_device(device)
     check_output(config)
@@ -93,41 +104,49 @@ def plan_training(
         encoder = Encoder(backbone) if backbone is not None else open_encoder(config.backbone, device)
     except WeightsError as error:
         missing = str(error)
-    backbone = encoder.backbone if encoder else None
     planned = plan_caches(config, encoder.key if encoder else "missing", readers)
-    dim, patch = (backbone.dim, backbone.patch) if backbone else (HeadShape().token_dim, PATCH)
+    dim = encoder.backbone.dim if encoder else HeadShape().token_dim
+    patch = encoder.backbone.patch if encoder else PATCH
     specs = sample_specs(config.view, config.head.taps, dim, patch)
-    sources = tuple(
-        PlannedSource(
-            tuple(place.name for place in plan.places),
-            plan.held_out is not None,
-            sum(map(len, plan.places)),
-            len(plan.keys),
-            done_on_disk(plan.folder, len(plan.keys), specs),
-            len(plan.keys) * bytes_per_sample(specs),
-            plan.folder,
-        )
-        for plan in planned
-    )
-    steps = sum(
-        steps_per_epoch(config, sum(len(plan.keys) for plan in of_member(planned, planned, member)))
-        for member in range(config.members)
-    )
+    sources = tuple(_planned_source(plan, specs) for plan in planned)
     folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
-    fold_steps = config.coarse_epochs * sum(
-        steps_per_epoch(config, sum(map(len, fold.learnt))) for fold in folds
-    )
+    steps, fold_steps = _member_steps(config, planned), _fold_steps(config, folds)
     features_s = training_s = None
-    if backbone is not None:
+    if encoder is not None:
         todo = sum(source.samples - source.cached for source in sources)
-        features_s = todo * _view_s(config, backbone, device) if todo else 0.0
+        features_s = todo * _view_s(config, encoder.backbone, device) if todo else 0.0
         coarse_s, fine_s = _step_s(config, dim, patch, device)
         epoch_s = config.coarse_epochs * coarse_s + config.fine_epochs * fine_s
         training_s = steps * epoch_s + fold_steps * coarse_s
-        training_s += down_s(config, dim, patch, device) if config.head.down_dim else 0.0
-        training_s += doubt_s(planned, folds, dim) if folds else 0.0
+        training_s += gravity_s(config, dim, patch, device) if config.head.gravity_dim else 0.0
+        training_s += uncertainty_s(planned, folds, dim) if folds else 0.0
     total = steps * (config.coarse_epochs + config.fine_epochs) + fold_steps
     return TrainingPlan(sources, total, features_s, training_s, missing, benchmarks_seen(planned))
+
+
+def _member_steps(config: TrainConfig, planned: Sequence[PlannedCache]) -> int:
+    """Steps of all members in one epoch."""
+    return sum(
+        steps_per_epoch(config, sum(len(plan.keys) for plan in of_member(planned, planned, member)))
+        for member in range(config.members)
+    )
+
+
+def _fold_steps(config: TrainConfig, folds: Sequence[Fold]) -> int:
+    """Steps of the heads of all folds, in all of their epochs."""
+    return config.coarse_epochs * sum(steps_per_epoch(config, sum(map(len, fold.training))) for fold in folds)
+
+
+def _planned_source(plan: PlannedCache, specs: Mapping[str, Spec]) -> PlannedSource:
+    return PlannedSource(
+        tuple(place.name for place in plan.places),
+        plan.held_out is not None,
+        sum(map(len, plan.places)),
+        len(plan.keys),
+        done_on_disk(plan.folder, len(plan.keys), specs),
+        len(plan.keys) * bytes_per_sample(specs),
+        plan.folder,
+    )
 
 
 def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:
@@ -149,7 +168,7 @@ def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[flo
 
     def step(is_fine: bool) -> None:
         loss = total_loss(*predict(head, batch, is_fine), config.loss)
-        loss.backward()
-        float(loss.detach())  # waits for a GPU
+        torch.autograd.backward(loss)
+        float(loss.detach())  # synchronises with a GPU
 
     return second_time(lambda: step(False)), second_time(lambda: step(True))

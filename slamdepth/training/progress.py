@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training tells whoever watches it."""
+"""Progress reports of a training."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class TrainStep:
-    """How far one stage of a training is.
+    """Progress within one stage of a training.
 
     Attributes:
-        stage: what is going on; each stage has a name of its own.
-        done, total: in a unit that takes about the same time throughout the stage.
-        detail: what is worth reading beside it, such as the epoch and the loss.
+        stage: unique name of the stage.
+        done, total: in units of about the same duration throughout the stage.
+        detail: text to show with it, such as the epoch and the loss.
     """
 
     stage: str
@@ -27,4 +27,4 @@ Progress = Callable[[TrainStep], None]
 
 
 def silent(step: TrainStep) -> None:
-    """A :data:`Progress` that tells nobody."""
+    """A :data:`Progress` that does nothing."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training made, for whoever draws and writes it down."""
+"""Results of a training, as needed for its report."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ class EpochFigures:
 
     Attributes:
         member, epoch: counted from 0.
-        is_fine: judged at full resolution; else at 1/7, whose losses are other numbers.
+        is_fine: loss at full resolution; else at 1/7. The two are not comparable.
         loss: mean training loss.
-        held_out_loss: the same loss without dropout, mean over the held-out places; None
-            where there are none.
-        held_out_abs_rel: AbsRel after one median a view, mean over the held-out places.
+        held_out_loss: loss without dropout, mean over the held-out places; None if there are none.
+        held_out_abs_rel: AbsRel after median scaling per view, mean over the held-out places.
         seconds: wall time of the epoch's steps.
     """
 
@@ -38,12 +37,12 @@ class EpochFigures:
 
 @dataclass(frozen=True)
 class SampleView:
-    """A view, what was measured of it and what the finished head says.
+    """A view with its measured depth and the prediction of the finished head.
 
     Attributes:
         image_rgb: ``(H, W, 3)`` uint8, as the network saw it.
         sensor_m, predicted_m: ``(H, W)`` float32 metres along z, 0 where unknown.
-        sigma_log: ``(H, W)`` float32 deviation of the predicted log depth.
+        sigma_log: ``(H, W)`` float32 standard deviation of the predicted log depth.
     """
 
     place: str
@@ -56,20 +55,19 @@ class SampleView:
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What a training made.
+    """Result of a training.
 
     Attributes:
         output: the head file.
         history: every epoch of every member, in order.
-        held_out: for each held-out place, the figures of :func:`~slamdepth.training.judge.judge`.
-        sigma_scale: factor on sigma stored in the head.
+        held_out: figures of each held-out place, see :func:`~slamdepth.training.judge.judge`.
+        sigma_scale: factor on sigma, stored in the head.
         samples: a few views with their prediction, held-out ones first.
-        places: every place trained on or held out, with how many samples of it and what was
-            noted while opening it.
-        about: what the head file's header says.
-        unseen_surest_half: by place and by what is taken for doubt, see
-            :func:`~slamdepth.training.out_of_fold.learn_doubt`, error of the surest half of
-            pixels over that of all; empty where members tell their own.
+        places: every place trained on or held out, with its number of samples and its notes.
+        about: the header of the head file.
+        unseen_surest_half: error of the surest half of the pixels over that of all, by left-out place
+            and by uncertainty measure, see
+            :func:`~slamdepth.training.out_of_fold.learn_uncertainty`; empty without out_of_fold.
     """
 
     output: Path

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hyper-parameters found by trial on held-out places, with Optuna (Akiba et al., KDD 2019).
+"""Hyper-parameter search on held-out places with Optuna (Akiba et al., KDD 2019).
 
-Every trial draws from a sampler seeded by how many trials are done, so a search that was
-killed and goes on makes the same trials as one that was not.
+The sampler of each trial is seeded by the number of finished trials, so a search that was killed and
+resumed makes the same trials as one that was not.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FIGURE = "abs_rel_frame_median"
-"""What a trial is judged by: AbsRel after one median a view, mean over the held-out places."""
+"""The score of a trial: AbsRel after median scaling per view, mean over the held-out places."""
 
 _DIVERGED = 1e3
 _HELD_OUT = "held_out"
@@ -45,7 +45,8 @@ class Trial:
     """One training of a search.
 
     Attributes:
-        settings: what was tried, by dotted name.
+        number: counted from 0.
+        settings: the values tried, by dotted name.
         score: mean of :data:`FIGURE` over the held-out places; lower is better.
         held_out: all figures of each held-out place.
     """
@@ -58,7 +59,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Every trial in order, the best of them, and the files."""
+    """All trials in order, the best of them, and the files."""
 
     trials: tuple[Trial, ...]
     best: Trial
@@ -75,20 +76,19 @@ def search_settings(
     backbone: DinoV2 | None = None,
     readers: Mapping[str, PlaceReader] | None = None,
 ) -> SearchResult:
-    """Train with settings from ``config.search`` until ``trials`` trials are done.
+    """Train with settings drawn from ``config.search`` until ``trials`` trials are done.
 
-    Trials of an earlier call count, so the same call goes on with a search that was killed,
-    and a larger number extends one. A trial trains one member. Beside the output are left
-    ``<stem>_search.sqlite3``, the study, and ``<stem>_best.yaml``, ``config`` with the best
-    settings found.
+    Trials of an earlier call count: the same call resumes a search that was killed, and a larger
+    number extends one. A trial trains one member. Two files are written to the folder of the output:
+    ``<stem>_search.sqlite3``, the study, and ``<stem>_best.yaml``, ``config`` with the best settings.
 
     Args:
-        backbone, readers: as for :func:`~slamdepth.training.loop.train_depth`.
+        backbone, readers: see :func:`~slamdepth.training.loop.train_depth`.
 
     Raises:
-        ConfigError: Optuna is not installed, there is nothing to search or nothing held out
-            to judge by, or a range leaves what its setting allows.
-        DatasetError, WeightsError, OutputError: as for training.
+        ConfigError: Optuna is not installed, no setting is to be searched, no place is held out, or
+            a range exceeds that of its setting.
+        DatasetError, WeightsError, OutputError: see :func:`~slamdepth.training.loop.train_depth`.
     """
     _check(config)
     optuna = _optuna()
@@ -111,7 +111,7 @@ def search_settings(
                 }
             )  # fmt: skip
 
-            def tell(result: TrainResult, trial: Any = trial) -> None:
+            def record(result: TrainResult, trial: Any = trial) -> None:
                 trial.set_user_attr(_HELD_OUT, json.dumps(result.held_out))
                 study.tell(trial, _score(result.held_out))
 
@@ -122,7 +122,7 @@ def search_settings(
                 progress=lambda step, stage=stage: progress(replace(step, stage=stage + step.stage)),  # type: ignore[misc]
                 backbone=backbone,
                 readers=readers,
-                on_result=tell,
+                on_result=record,
             )
             done.output.unlink(missing_ok=True)
             logger.info("trial %d: %s gave %.4f", number, tried, _score(done.held_out))
@@ -137,10 +137,10 @@ def search_settings(
 
 
 def with_settings(config: TrainConfig, values: Mapping[str, float]) -> TrainConfig:
-    """``config`` with ``values`` by dotted name.
+    """``config`` with the settings ``values``, given by dotted name.
 
     Raises:
-        ConfigError: a value is out of range; names its setting.
+        ConfigError: a value is out of range. The message names its setting.
     """
     tree = config.model_dump(mode="json")
     for name, value in values.items():
@@ -159,7 +159,7 @@ def _check(config: TrainConfig) -> None:
             "'learning_rate: {low: 5e-4, high: 5e-3, log: true}'"
         )
     if not any(source.held_out for source in config.sources):
-        raise ConfigError("setting 'sources': a search needs a place under 'held_out' to judge by")
+        raise ConfigError("setting 'sources': a search needs a place under 'held_out' to score by")
     for name, where in config.search.items():
         for value in where.choices or (where.low, where.high):
             assert value is not None
@@ -178,18 +178,18 @@ def _optuna() -> Any:
 
 
 def _open_study(optuna: Any, file: Path, name: str) -> Any:
-    """The study ``name`` in ``file``; a trial that was going on when a search died is given up."""
+    """The study ``name`` in ``file``. A trial that was running when a search was killed is marked failed."""
     try:
         storage = optuna.storages.RDBStorage(f"sqlite:///{file}")
         study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
         for trial in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
             study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
-    except Exception as error:  # of sqlite, SQLAlchemy or Optuna: each has a tree of its own
+    except Exception as error:  # sqlite, SQLAlchemy and Optuna have no common base
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise OutputError(f"{file}: cannot be used as a study: {reason}; delete or move it") from error
     earlier = len(_finished(optuna, study))
     if earlier:
-        logger.warning("%s: going on after %d trials", file, earlier)
+        logger.warning("%s: resuming after %d trials", file, earlier)
     return study
 
 
@@ -221,7 +221,7 @@ def _write_best(path: Path, config: TrainConfig, best: Trial, trials: int) -> No
     places = ", ".join(best.held_out)
     header = (
         f"# The best of {trials} trials, number {best.number}: {FIGURE} {best.score:.4f} on {places}.\n"
-        "# It was chosen by these places, so figures on them are no longer a test.\n"
+        "# It was selected on these places, so figures on them are no longer a test.\n"
         f"#   slamdepth train-depth {path.name}\n"
     )
     write_text(path, header + yaml.safe_dump(settings, sort_keys=False))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays on disk that grow group by group and survive their writer's death at any moment.
+"""Arrays on disk that grow group by group and stay consistent if the writer is killed at any moment.
 
-Rows are on the disk before their marks are, so a mark never stands before a half-written
-row, whether the process was killed or the power went. Groups are the same whatever was
-done before: a network's output for an image can depend on what else is in its batch.
+Samples are flushed to disk before they are marked as done, so a sample marked as done is complete
+even after a power failure. The grouping does not depend on what was done before: a network's output
+for an image can depend on the rest of its batch.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ _SPARE_BYTES = 64 << 20
 _COMMIT_EVERY_S = 2.0
 
 Spec = tuple[tuple[int, ...], type]
-"""Shape of one sample and its type."""
+"""Shape of one sample, and its type."""
 
 
 def bytes_per_sample(specs: Mapping[str, Spec]) -> int:
-    """Size of one sample on disk."""
+    """Size of one sample on disk, in bytes."""
     return sum(
         int(np.prod(shape, dtype=np.int64)) * np.dtype(kind).itemsize for shape, kind in specs.values()
     )
 
 
 def done_on_disk(folder: Path, count: int, specs: Mapping[str, Spec]) -> int:
-    """How many of ``count`` samples ``folder`` has already; nothing is changed."""
+    """How many of ``count`` samples are done in ``folder``; nothing is changed."""
     if not _is_ours(folder, count, specs):
         return 0
     return int(np.count_nonzero(np.load(folder / "done.npy", mmap_mode="r")))
 
 
 class SampleStore:
-    """``count`` samples in ``folder``, one memory-mapped file an array.
+    """``count`` samples in ``folder``, with one memory-mapped file per array.
 
     Args:
         specs: shape and type of each array's sample.
@@ -61,7 +61,7 @@ class SampleStore:
         self.folder = folder
         is_fresh = not _is_ours(folder, count, specs)
         todo = count if is_fresh else count - done_on_disk(folder, count, specs)
-        _check_room(folder, todo * bytes_per_sample(specs))
+        _check_free_space(folder, todo * bytes_per_sample(specs))
         if is_fresh:
             (folder / _NOTE).unlink(missing_ok=True)
         self.arrays: dict[str, Any] = {
@@ -85,8 +85,9 @@ class SampleStore:
         return [group for group in groups if not done[group.start : group.stop].all()]
 
     def put(self, group: range, **values: Any) -> None:
-        """Write the samples ``group`` of every array, ``(len(group), ...)`` each; they count as done
-        after the next :meth:`commit`, which comes by itself every few seconds.
+        """Write the samples ``group`` of every array, ``(len(group), ...)`` each.
+
+        They count as done after the next :meth:`commit`, which also happens every few seconds.
 
         Raises:
             ValueError: a value has another shape; nothing is written.
@@ -102,7 +103,7 @@ class SampleStore:
             self.commit()
 
     def commit(self) -> None:
-        """Wait until everything written is on the disk, then mark it done."""
+        """Wait until everything written is on disk, then mark it as done."""
         if self._written:
             for name, array in self.arrays.items():
                 if name != "done":
@@ -116,7 +117,7 @@ class SampleStore:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Make ``folder`` and keep other processes out of it; the system opens it if this one dies.
+    """Make ``folder`` and hold an exclusive lock on it; the lock ends with the process.
 
     Raises:
         OutputError: the folder cannot be made.
@@ -152,7 +153,7 @@ def _shapes(count: int, specs: Mapping[str, Spec]) -> str:
 
 
 def _is_ours(folder: Path, count: int, specs: Mapping[str, Spec]) -> bool:
-    """True where every array is there, whole, of these shapes and types."""
+    """True if every array is there, complete, with these shapes and types."""
     try:
         if (folder / _NOTE).read_text(encoding="utf-8") != _shapes(count, specs):
             return False
@@ -165,8 +166,8 @@ def _is_ours(folder: Path, count: int, specs: Mapping[str, Spec]) -> bool:
     return True
 
 
-def _check_room(folder: Path, needed_bytes: int) -> None:
-    """A full disk under a memory map kills the process without a word; so ask before."""
+def _check_free_space(folder: Path, needed_bytes: int) -> None:
+    """Check before: a full disk under a memory map kills the process without a message."""
     free = shutil.disk_usage(folder).free
     if needed_bytes and needed_bytes + _SPARE_BYTES > free:
         raise OutputError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plain folder of images as a sequence: taken at equal intervals, by a camera that has to be named."""
+"""A folder of images as a sequence, taken at equal intervals by a camera that has to be given."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera, what_to_write
+from slamdepth.calibration import CAMERA_FILE, what_to_write
 from slamdepth.datasets.image_files import has_images, list_images
 from slamdepth.datasets.registry import register_last_reader
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
@@ -26,7 +26,7 @@ PAIRS_FILE = "camera.json"
 
 @register_last_reader
 class ImagesReader:
-    """Opens folders of images that are of no other layout."""
+    """Opens folders of images without another layout."""
 
     name = "images"
     needs = "a folder of images, in the order of their names; camera.yaml in it, or --camera"
@@ -42,7 +42,7 @@ class ImagesReader:
         _check_no_depth(sample_path)
         camera_path = path / CAMERA_FILE
         if camera is None and camera_path.exists():
-            camera = read_camera(camera_path, notes)
+            camera = Camera.from_file(camera_path, notes)
         if camera is None:
             raise CameraError(
                 f"{path}: the intrinsics of these images are unknown: write {camera_path} or pass --camera "
@@ -53,11 +53,11 @@ class ImagesReader:
 
 
 class FolderSequence(ImageSequence):
-    """The :class:`~slamdepth.datasets.base.Dataset` of a folder of images, reduced where they are large.
+    """The :class:`~slamdepth.datasets.base.Dataset` of a folder of images; large ones are reduced.
 
     Args:
-        taken_by: the camera of the images as they lie there; its ``fps`` makes the times.
-        notes: takes what is assumed of them.
+        taken_by: the camera of the images as they are on disk; its ``fps`` gives the times.
+        notes: takes a line for each assumption.
     """
 
     def __init__(self, path: Path, taken_by: Camera, images: tuple[Path, ...], notes: list[str]) -> None:

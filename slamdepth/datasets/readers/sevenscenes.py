@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera
+from slamdepth.calibration import CAMERA_FILE
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import ImageSequence, check_size, first_image
 from slamdepth.errors import DatasetError
@@ -45,7 +45,7 @@ class SevenScenesReader:
     )
 
     def matches(self, path: Path) -> bool:
-        # not any frame-*: a film cut into frame-0001.png is none of it
+        # not any frame-*: ffmpeg writes the images of a video as frame-0001.png
         return any(next(path.glob(f"frame-*.{what}"), None) for what in _ENDINGS)
 
     def open(self, path: Path, camera: Camera | None) -> ImageSequence:
@@ -59,7 +59,7 @@ class SevenScenesReader:
         check_size(sample_path, sample_shape, camera)
 
         timestamps_s = np.array(list(frames), dtype=np.float64) / FRAME_RATE_HZ
-        depth_paths = tuple(_beside(image, ".depth.png") for image in image_paths)
+        depth_paths = tuple(_sibling(image, ".depth.png") for image in image_paths)
         with_depth = sum(depth is not None for depth in depth_paths)
         if 0 < with_depth < len(depth_paths):
             notes.append(f"{len(depth_paths) - with_depth} of {len(depth_paths)} frames have no depth image")
@@ -114,7 +114,7 @@ def _find_frames(path: Path) -> dict[int, Path]:
     return dict(sorted(frames.items()))
 
 
-def _beside(image_path: Path, ending: str) -> Path | None:
+def _sibling(image_path: Path, ending: str) -> Path | None:
     path = image_path.with_name(image_path.name.partition(".")[0] + ending)
     return path if path.is_file() else None
 
@@ -126,7 +126,7 @@ def _read_poses(
     poses: list[NDArray[np.float64]] = []
     invalid = missing = 0
     for image_path, time_s in zip(image_paths, timestamps_s, strict=True):
-        pose_path = _beside(image_path, ".pose.txt")
+        pose_path = _sibling(image_path, ".pose.txt")
         T_world_camera = None if pose_path is None else read_pose(pose_path)
         if T_world_camera is not None:
             times_s.append(float(time_s))
@@ -144,7 +144,7 @@ def _read_poses(
 
 def _find_camera(path: Path, camera: Camera | None, notes: list[str]) -> Camera:
     if camera is None and (path / CAMERA_FILE).exists():
-        camera = read_camera(path / CAMERA_FILE, notes)
+        camera = Camera.from_file(path / CAMERA_FILE, notes)
     if camera is None:
         notes.append(
             "intrinsics 585 585 320 240 known by the 7-Scenes layout; depth was never calibrated to colour"

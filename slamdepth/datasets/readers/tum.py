@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth.calibration import CAMERA_FILE, what_to_write
 from slamdepth.datasets.association import associate
-from slamdepth.datasets.camera_file import CAMERA_FILE, read_camera, what_to_write
 from slamdepth.datasets.image_files import has_images
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import (
@@ -157,7 +157,7 @@ def _match_depth(
 def _find_camera(path: Path, image_shape: tuple[int, ...], notes: list[str]) -> Camera:
     camera_path = path / CAMERA_FILE
     if camera_path.exists():
-        return read_camera(camera_path, notes)
+        return Camera.from_file(camera_path, notes)
     for name in (path.name, path.resolve().name):  # the second for '.' and links
         camera = known_camera(name)
         if camera is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A video file as a sequence: no depth, no ground truth, and a camera that has to be named."""
+"""A video file as a sequence without depth and ground truth; its camera has to be given."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slamdepth.datasets.camera_file import what_to_write
+from slamdepth.calibration import what_to_write
+from slamdepth.datasets.base import Dataset
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
 from slamdepth.datasets.sequence import check_size
@@ -34,7 +35,7 @@ class VideoReader:
     def open(self, path: Path, camera: Camera | None) -> VideoSequence:
         video = VideoFile(path)
         if camera is None:
-            # a camera.yaml that lies beside a video may be another's
+            # a camera.yaml next to a video may belong to another one
             raise CameraError(
                 f"{path}: the intrinsics of a video are unknown: pass --camera FILE, a camera.yaml with "
                 f"{what_to_write(video.width, video.height)}"
@@ -43,7 +44,7 @@ class VideoReader:
         return VideoSequence(video, camera)
 
 
-class VideoSequence:
+class VideoSequence(Dataset):
     """The :class:`~slamdepth.datasets.base.Dataset` of a video.
 
     Frames are decoded in order, so reading forwards is fast; a step back starts from the first frame again.

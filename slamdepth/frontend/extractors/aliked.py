@@ -11,11 +11,11 @@ import numpy as np
 
 from slamdepth.config import FeatureConfig
 from slamdepth.errors import WeightsError
-from slamdepth.frontend.features import Features, ScaleLevels, cell_edge_px, register_extractor, spread
+from slamdepth.frontend.features import Features, ScaleLevels, register_extractor
+from slamdepth.frontend.keypoints import cell_edge_px, pixels, responses, spread
 from slamdepth.frontend.metric import UnitL2
 from slamdepth.frontend.networks import LightGlue, clear_errors, network_class
-from slamdepth.frontend.opencv_features import pixels, responses
-from slamdepth.frontend.orb_descriptors import OrbWords
+from slamdepth.frontend.orb_descriptors import OrbDescriptors
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
@@ -33,8 +33,8 @@ class AlikedExtractor:
 
     Its graph takes ``image`` ``(1, 3, rows, columns)`` and gives ``keypoints`` ``(N, 2)``, -1 to 1 from
     the centre of the first pixel to that of the last, ``descriptors`` ``(N, 128)`` and ``scores`` ``(N,)``.
-    An image is filled up to the input's shape, not stretched. The thresholds are guesses: no published
-    file was at hand to measure them with.
+    An image is padded to the input's aspect, not stretched. The thresholds are guesses, not measured with
+    a published file.
 
     Raises:
         WeightsError: the file is missing, unreadable or another network.
@@ -45,7 +45,7 @@ class AlikedExtractor:
         assert config.weights is not None
         self._path = Path(config.weights).expanduser()
         self._count = config.count
-        # it knows no sizes: what is at most 2.8 times nearer or farther may match
+        # its keypoints have no size: those at most 2.8 times nearer or farther may match
         self.levels = ScaleLevels(2.0, 1)
         kind, parameters = network_class("ALIKED"), network_class("ALIKED_Params")()
         self._rows, self._columns = _input_size(self._path)
@@ -71,7 +71,7 @@ class AlikedExtractor:
             sigma_px=self.levels.sigma_px(octave),
             descriptors=described[at],
             metric=_METRIC,
-            orb_words=OrbWords(gray, self._count),
+            orb_descriptors=OrbDescriptors(gray, self._count),
             matcher=matcher,
         )
 
@@ -81,8 +81,8 @@ class AlikedExtractor:
 
         zoom = max(gray.shape[0] / self._rows, gray.shape[1] / self._columns)
         rows, columns = (max(1, round(side * zoom)) for side in (self._rows, self._columns))
-        below, beside = max(0, rows - gray.shape[0]), max(0, columns - gray.shape[1])
-        image = cv2.copyMakeBorder(gray, 0, below, 0, beside, cv2.BORDER_REPLICATE)
+        bottom, right = max(0, rows - gray.shape[0]), max(0, columns - gray.shape[1])
+        image = cv2.copyMakeBorder(gray, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
         with clear_errors(self._path, "ALIKED"):
             keypoints, described = self._network.detectAndCompute(
                 cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), None

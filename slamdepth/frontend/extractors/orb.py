@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ORB: the default feature, and the words that places are recognised by."""
+"""ORB: the default feature, and the one that places are recognised by."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.config import FeatureConfig
-from slamdepth.frontend.features import Features, ScaleLevels, cell_edge_px, register_extractor, spread
+from slamdepth.frontend.features import Features, ScaleLevels, register_extractor
+from slamdepth.frontend.keypoints import cell_edge_px, pixels, responses, spread
 from slamdepth.frontend.metric import ORB
-from slamdepth.frontend.opencv_features import pixels, responses
 from slamdepth.types import Camera
 
 if TYPE_CHECKING:

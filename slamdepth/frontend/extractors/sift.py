@@ -11,6 +11,7 @@ from slamdepth.config import FeatureConfig
 from slamdepth.frontend.features import ScaleLevels, register_extractor
 from slamdepth.frontend.metric import UnitL2
 from slamdepth.frontend.opencv_features import OpenCvExtractor
+from slamdepth.typing import Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,6 +39,7 @@ class SiftExtractor(OpenCvExtractor):
             finest_px=1.8,
         )
 
-    def descriptors(self, described: NDArray[Any]) -> NDArray[np.float32]:
+    def descriptors(self, described: NDArray[Any]) -> Floats32:
         total = np.maximum(described.sum(axis=1, keepdims=True), 1e-6)
-        return np.sqrt(described / total, dtype=np.float32)
+        roots: Floats32 = np.sqrt(described / total, dtype=np.float32)
+        return roots

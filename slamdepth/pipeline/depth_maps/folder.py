@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from slamdepth.errors import ConfigError, OutputError
-from slamdepth.io import write_json, write_text
-from slamdepth.pipeline.folder import writable
+from slamdepth.io import writable, write_json, write_text
 from slamdepth.types import DepthKind
 
 ABOUT = "depth.json"

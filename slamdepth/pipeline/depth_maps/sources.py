@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from slamdepth.datasets import Dataset, known_readers, open_dataset
-from slamdepth.datasets.image_files import IMAGE_ENDINGS, list_images, read_picture, short_names
+from slamdepth.datasets.image_files import IMAGE_ENDINGS, list_images, read_image_frame, short_names
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics, find_camera_file, intrinsics_of
 from slamdepth.datasets.sequence import check_size
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
@@ -139,7 +139,7 @@ class _PictureSource:
     def shots(self) -> Iterator[Shot]:
         names = short_names(self._images)
         for index, (path, name) in enumerate(zip(self._images, names, strict=True)):
-            yield Shot(name, path.name, _stamp(path), partial(read_picture, path, index, self._given))
+            yield Shot(name, path.name, _stamp(path), partial(read_image_frame, path, index, self._given))
 
 
 class _VideoSource:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readers of training data, one file each; see :mod:`slamdepth.training.data`."""
+"""Readers of training data, one file per layout; see :mod:`slamdepth.training.data`."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +18,7 @@ from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import read_image_rgb
 from slamdepth.training.data import fingerprint, register_reader
 from slamdepth.types import Camera, Frame
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from slamdepth.typing import Floats, Floats32
 
 FOCAL_PX, WIDTH_PX = 886.81, 1024
 """Focal length of an image ``WIDTH_PX`` wide: 60 degrees across."""
@@ -30,7 +28,7 @@ _KEY = "dataset"
 
 @dataclass(frozen=True)
 class HypersimPlace:
-    """All frames of all cameras of one scene that have image and distances.
+    """All frames of one scene, from all of its cameras, that have both image and distances.
 
     Attributes:
         images, distances: file paths, in the same order.
@@ -51,7 +49,7 @@ class HypersimPlace:
         return fingerprint((*self.images, *self.distances), self.camera)
 
     def read(self, index: int) -> Frame:
-        """The frame ``index``; see :meth:`slamdepth.training.data.Place.read`."""
+        """Frame ``index`` with depth; see :meth:`slamdepth.training.data.Place.read`."""
         try:
             image_rgb = read_image_rgb(self.images[index])
         except ImageDecodeError as error:
@@ -63,8 +61,8 @@ class HypersimPlace:
                 raise DatasetError(f"{path}: {shape[:2]} pixels, the scene's first image has {expected}")
         return Frame(index, float(index), image_rgb, self.camera, planar_depth_m(distance_m, self.camera))
 
-    def down(self, index: int) -> NDArray[np.float64] | None:
-        """Unknown: nothing here says it."""
+    def gravity(self, index: int) -> Floats | None:
+        """None: this layout does not record gravity."""
         del index
         return None
 
@@ -83,7 +81,7 @@ class HypersimReader:
         return next(folder.glob("images/scene_cam_*"), None) is not None
 
     def open(self, folder: Path) -> HypersimPlace:
-        _h5py()  # before hours of other work
+        _h5py()  # fails now rather than after hours of training
         pairs = []
         distances = sorted(folder.glob("images/scene_cam_*_geometry_hdf5/frame.*.depth_meters.hdf5"))
         for distance in distances:
@@ -102,7 +100,7 @@ class HypersimReader:
             raise DatasetError(str(error)) from error
         focal = FOCAL_PX * width / WIDTH_PX
         notes = [
-            f"focal length {focal:.2f} px taken for Hypersim's usual camera; some scenes are rendered "
+            f"focal length {focal:.2f} px assumed, that of Hypersim's usual camera; some scenes are rendered "
             "with a shifted one"
         ]
         if len(pairs) < len(distances):
@@ -116,8 +114,8 @@ class HypersimReader:
         )
 
 
-def read_distance_m(path: Path) -> NDArray[np.float32]:
-    """The ``(H, W)`` distances in metres of a ``depth_meters.hdf5`` file, as they are.
+def read_distance_m(path: Path) -> Floats32:
+    """The unmodified ``(H, W)`` distances of a ``depth_meters.hdf5`` file, in metres.
 
     Raises:
         DatasetError: h5py is not installed, the file is damaged, or holds no such array.
@@ -138,11 +136,11 @@ def read_distance_m(path: Path) -> NDArray[np.float32]:
     return values.astype(np.float32)
 
 
-def planar_depth_m(distance_m: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+def planar_depth_m(distance_m: Floats32, camera: Camera) -> Floats32:
     """Depth along z of distances along rays, both ``(H, W)`` metres.
 
     ``z = d / sqrt(x^2 + y^2 + 1)`` for the ray ``(x, y, 1)`` of a pixel of ``camera``, which
-    has no distortion. Where the distance is not finite or not positive it is 0, unknown.
+    has no distortion. Distances that are not finite or not positive become 0, unknown.
     """
     x = (np.arange(camera.width) - camera.cx) / camera.fx
     y = (np.arange(camera.height) - camera.cy) / camera.fy

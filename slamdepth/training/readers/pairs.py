@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training pairs: a folder a place, with ``camera.json`` and ``NNNNN.jpg`` + ``NNNNN.png`` files.
+"""Training pairs: one folder per place, with ``camera.json`` and ``NNNNN.jpg`` + ``NNNNN.png`` files.
 
-``camera.json`` has ``width height fx fy cx cy`` in pixels; where the depth is not in millimetres,
-``depth_unit_m``: metres per unit of the 16-bit depth images; and where the lens distorts both images,
-``distortion``: ``[k1, k2, p1, p2, k3]`` as OpenCV orders them. ``gravity.txt`` may say where
-down is: lines ``NNNNN x y z``, the pair's name and the unit direction of gravity in the camera's frame
-(x right, y down, z forward).
+``camera.json`` holds ``width height fx fy cx cy`` in pixels. Optional keys are ``depth_unit_m``, metres
+per unit of the 16-bit depth images (default: 0.001), and ``distortion``, ``[k1, k2, p1, p2, k3]`` in
+OpenCV's order, which holds for both images. An optional ``gravity.txt`` gives the direction of gravity:
+lines ``NNNNN x y z``, the pair's name and a unit vector in the camera frame (x right, y down, z forward).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -21,9 +19,7 @@ from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import read_depth_raw, read_image_rgb
 from slamdepth.training.data import fingerprint, register_reader
 from slamdepth.types import Camera, Frame
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from slamdepth.typing import Floats
 
 GRAVITY_FILE = "gravity.txt"
 _IMAGE_ENDINGS = (".jpg", ".jpeg")
@@ -46,12 +42,12 @@ class _CameraFile(BaseModel):
 
 @dataclass(frozen=True)
 class PairPlace:
-    """Pairs of one place taken by one camera.
+    """Image pairs of one place, taken by one camera.
 
     Attributes:
         images, depths: file paths, in the same order.
         depth_unit_m: metres per unit of the depth files.
-        downs: unit direction of gravity in the camera's frame, of each pair; empty where none is known.
+        gravities: unit direction of gravity in the camera frame, one per pair; empty if none is known.
     """
 
     name: str
@@ -61,18 +57,18 @@ class PairPlace:
     depth_unit_m: float
     notes: tuple[str, ...] = ()
     benchmark: str | None = None
-    downs: tuple[_Direction | None, ...] = ()
+    gravities: tuple[_Direction | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.images)
 
     @property
     def fingerprint(self) -> str:
-        told = (self.downs,) if self.downs else ()
-        return fingerprint((*self.images, *self.depths), self.camera, self.depth_unit_m, *told)
+        known = (self.gravities,) if self.gravities else ()
+        return fingerprint((*self.images, *self.depths), self.camera, self.depth_unit_m, *known)
 
     def read(self, index: int) -> Frame:
-        """The pair ``index``; see :meth:`slamdepth.training.data.Place.read`."""
+        """Image and depth of pair ``index``; see :meth:`slamdepth.training.data.Place.read`."""
         try:
             image_rgb, raw = read_image_rgb(self.images[index]), read_depth_raw(self.depths[index])
         except ImageDecodeError as error:
@@ -84,9 +80,9 @@ class PairPlace:
         depth_m = (raw.astype(np.float32) * self.depth_unit_m).astype(np.float32)
         return Frame(index, float(index), image_rgb, self.camera, depth_m)
 
-    def down(self, index: int) -> NDArray[np.float64] | None:
-        """What gravity.txt says of the pair ``index``, ``(3,)``; None where it says nothing."""
-        found = self.downs[index] if self.downs else None
+    def gravity(self, index: int) -> Floats | None:
+        """Unit direction of gravity ``(3,)`` of pair ``index`` from gravity.txt; None if not listed."""
+        found = self.gravities[index] if self.gravities else None
         return None if found is None else np.array(found)
 
 
@@ -112,19 +108,19 @@ class PairReader:
             raise DatasetError(f"{folder}: no pair of NNNNN.jpg and NNNNN.png here")
         alone = len(images) - len(pairs)
         notes = (f"{alone} of {len(images)} images have no depth image",) if alone else ()
-        told = read_gravity(folder / GRAVITY_FILE) if (folder / GRAVITY_FILE).is_file() else {}
+        listed = read_gravity(folder / GRAVITY_FILE) if (folder / GRAVITY_FILE).is_file() else {}
         return PairPlace(
             folder.name, camera, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs), unit, notes,
-            downs=tuple(told.get(image.stem) for image, _ in pairs) if told else (),
+            gravities=tuple(listed.get(image.stem) for image, _ in pairs) if listed else (),
         )  # fmt: skip
 
 
 def read_camera(path: Path) -> tuple[Camera, float]:
-    """The camera of a ``camera.json``, and metres per unit of the depth images.
+    """The camera of a ``camera.json`` and the metres per unit of the depth images.
 
     Raises:
         DatasetError: the file is missing or not readable, or a key is missing, unknown or out of
-            range; names it.
+            range. The message names it.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -135,14 +131,14 @@ def read_camera(path: Path) -> tuple[Camera, float]:
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: not readable: {error}") from error
     try:
-        said = _CameraFile.model_validate_json(text)
+        file = _CameraFile.model_validate_json(text)
     except ValidationError as error:
-        raise DatasetError(f"{path}: {_trouble(error)}") from error
-    intrinsics = said.width, said.height, said.fx, said.fy, said.cx, said.cy
-    return Camera(*intrinsics, distortion=said.distortion), said.depth_unit_m
+        raise DatasetError(f"{path}: {_problem(error)}") from error
+    intrinsics = file.width, file.height, file.fx, file.fy, file.cx, file.cy
+    return Camera(*intrinsics, distortion=file.distortion), file.depth_unit_m
 
 
-def _trouble(error: ValidationError) -> str:
+def _problem(error: ValidationError) -> str:
     first = error.errors()[0]
     name = ".".join(str(part) for part in first["loc"])
     if name.startswith("distortion"):
@@ -155,16 +151,16 @@ def _trouble(error: ValidationError) -> str:
 
 
 def read_gravity(path: Path) -> dict[str, _Direction]:
-    """Unit directions of gravity in the camera's frame, by the names of their pairs.
+    """Unit directions of gravity in the camera frame, by pair name.
 
     Raises:
-        DatasetError: a line is not a name and a unit direction; names it.
+        DatasetError: a line is not a name and a unit direction. The message names it.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: not readable: {error}") from error
-    told: dict[str, _Direction] = {}
+    directions: dict[str, _Direction] = {}
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
@@ -176,5 +172,5 @@ def read_gravity(path: Path) -> dict[str, _Direction]:
         length = float(np.sqrt(x * x + y * y + z * z))
         if not abs(length - 1.0) < _UNIT_TOLERANCE:
             raise DatasetError(f"{path}: line {number}: expected a name and a unit direction x y z: {line!r}")
-        told[name] = (x / length, y / length, z / length)
-    return told
+        directions[name] = (x / length, y / length, z / length)
+    return directions

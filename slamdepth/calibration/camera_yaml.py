@@ -13,34 +13,36 @@
     depth_factor: 5000.0                    # raw units per metre; may be absent
     fps: 30.0                               # may be absent
 
-Files of OpenCV's and ROS's calibration are read too (:mod:`slamdepth.datasets.camera_dialects`).
+Files of OpenCV's and ROS's calibration are read too (:mod:`slamdepth.calibration.dialects`).
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
-from slamdepth.datasets.camera_check import check_plausible
-from slamdepth.datasets.camera_dialects import CalibrationLoader, as_yaml, is_calibration, translated
+from slamdepth.calibration.dialects import CalibrationLoader, as_yaml, is_calibration, translated
+from slamdepth.calibration.plausible import Pinhole, check_plausible
 from slamdepth.errors import CameraError
-from slamdepth.io import write_text
-from slamdepth.types import Camera
 
 _log = logging.getLogger(__name__)
+
+_Camera = TypeVar("_Camera", bound=Pinhole)
 
 CAMERA_FILE = "camera.yaml"
 REQUIRED_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 OPTIONAL_KEYS = ("distortion", "depth_factor", "fps")
 
 
-def read_camera(path: str | Path, notes: list[str] | None = None) -> Camera:
+def read_camera(path: str | Path, make: Callable[..., _Camera], notes: list[str] | None = None) -> _Camera:
     """Read a ``camera.yaml``, or a calibration as OpenCV or ROS write it.
 
     Args:
+        make: the class of the camera, which takes the keys of the file by name.
         notes: takes a line for whatever is unusual in it, or was read from another format; None: it is
             logged as a warning.
 
@@ -51,7 +53,7 @@ def read_camera(path: str | Path, notes: list[str] | None = None) -> Camera:
     path = Path(path)
     values = _load(path)
     foreign = is_calibration(values)
-    camera = _parse(path, translated(path, values) if foreign else values)
+    camera = _made(path, translated(path, values) if foreign else values, make)
     try:
         unusual = [f"{path.name}: {note}" for note in check_plausible(camera)]
     except CameraError as error:
@@ -66,13 +68,13 @@ def read_camera(path: str | Path, notes: list[str] | None = None) -> Camera:
     return camera
 
 
-def _described(camera: Camera) -> str:
+def _described(camera: Pinhole) -> str:
     values = " ".join(f"{key} {getattr(camera, key):g}" for key in ("fx", "fy", "cx", "cy"))
-    bent = ", ".join(f"{value:g}" for value in camera.distortion)
-    return f"{camera.width}x{camera.height}, {values}, distortion [{bent}], {camera.fps:g} Hz"
+    distortion = ", ".join(f"{value:g}" for value in camera.distortion)
+    return f"{camera.width}x{camera.height}, {values}, distortion [{distortion}], {camera.fps:g} Hz"
 
 
-def _parse(path: Path, values: dict[Any, Any]) -> Camera:
+def _made(path: Path, values: dict[Any, Any], make: Callable[..., _Camera]) -> _Camera:
     allowed = REQUIRED_KEYS + OPTIONAL_KEYS
     unknown = [key for key in values if key not in allowed]
     if unknown:
@@ -92,7 +94,7 @@ def _parse(path: Path, values: dict[Any, Any]) -> Camera:
         else:
             settings[key] = _number(path, key, value)
     try:
-        return Camera(**settings)
+        return make(**settings)
     except CameraError as error:
         raise CameraError(f"{path}: {str(error).removeprefix('camera: ')}") from error
 
@@ -106,17 +108,13 @@ def what_to_write(width: int, height: int) -> str:
     )
 
 
-def write_camera(path: str | Path, camera: Camera) -> None:
-    """Write ``camera`` so that :func:`read_camera` gives back an equal one, should it be a plausible one.
-
-    Raises:
-        OutputError: ``path`` cannot be written.
-    """
+def camera_yaml(camera: Pinhole) -> str:
+    """The text of a ``camera.yaml`` that reads back as an equal camera, should it be a plausible one."""
     values: dict[str, Any] = {key: int(getattr(camera, key)) for key in ("width", "height")}
     values |= {key: float(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy")}
     values["distortion"] = [float(value) for value in camera.distortion]
     values |= {key: float(getattr(camera, key)) for key in ("depth_factor", "fps")}
-    write_text(path, yaml.safe_dump(values, sort_keys=False, default_flow_style=None))
+    return yaml.safe_dump(values, sort_keys=False, default_flow_style=None)
 
 
 def _load(path: Path) -> dict[Any, Any]:

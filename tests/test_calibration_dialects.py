@@ -14,7 +14,7 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from slamdepth.datasets import open_dataset, read_camera
+from slamdepth.datasets import open_dataset
 from slamdepth.errors import CameraError
 from slamdepth.types import Camera
 
@@ -69,7 +69,7 @@ projection_matrix:
 
 def read(folder: Path, text: str) -> Camera:
     (folder / "own.yaml").write_text(text)
-    return read_camera(folder / "own.yaml", [])
+    return Camera.from_file(folder / "own.yaml", [])
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_what_was_read_is_noted(tmp_path: Path, tiny_room: Path, caplog: pytest.
     )
     assert open_dataset(tiny_room, path).notes[0] == said
     with caplog.at_level(logging.WARNING, logger="slamdepth"):
-        read_camera(path)
+        Camera.from_file(path)
     assert said in caplog.text
 
 
@@ -105,18 +105,24 @@ real = st.floats(-1e-2, 1e-2)
     st.lists(real, max_size=5), st.sampled_from(["yml", "json"]),
 )  # fmt: skip
 def test_what_opencv_writes_comes_back(
-    tmp_path: Path, focal: tuple[float, float], centre: tuple[float, float], bent: list[float], ending: str
+    tmp_path: Path,
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    distortion: list[float],
+    ending: str,
 ) -> None:
     path = tmp_path / f"own.{ending}"
     storage = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)
     storage.write("image_width", 640)
     storage.write("image_height", 480)
     storage.write("camera_matrix", np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]]))
-    storage.write("distortion_coefficients", np.array([bent or [0.0]]))
+    storage.write("distortion_coefficients", np.array([distortion or [0.0]]))
     storage.release()
-    camera = read_camera(path, [])
+    camera = Camera.from_file(path, [])
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((*focal, *centre), rel=1e-14)
-    assert camera.distortion == pytest.approx((*bent, *[0.0] * (5 - len(bent))), rel=1e-14, abs=1e-300)
+    assert camera.distortion == pytest.approx(
+        (*distortion, *[0.0] * (5 - len(distortion))), rel=1e-14, abs=1e-300
+    )
 
 
 @RELAXED
@@ -125,17 +131,17 @@ def test_what_opencv_writes_comes_back(
     st.lists(real, min_size=4, max_size=5),
 )  # fmt: skip
 def test_what_ros_writes_comes_back(
-    tmp_path: Path, focal: tuple[float, float], centre: tuple[float, float], bent: list[float]
+    tmp_path: Path, focal: tuple[float, float], centre: tuple[float, float], distortion: list[float]
 ) -> None:
     K = [focal[0], 0.0, centre[0], 0.0, focal[1], centre[1], 0.0, 0.0, 1.0]
     values: dict[str, Any] = {
         "image_width": 640, "image_height": 480, "distortion_model": "plumb_bob",
         "camera_matrix": {"rows": 3, "cols": 3, "data": K},
-        "distortion_coefficients": {"rows": 1, "cols": len(bent), "data": bent},
+        "distortion_coefficients": {"rows": 1, "cols": len(distortion), "data": distortion},
     }  # fmt: skip
     camera = read(tmp_path, yaml.safe_dump(values))
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (*focal, *centre)
-    assert camera.distortion == (*bent, *[0.0] * (5 - len(bent)))
+    assert camera.distortion == (*distortion, *[0.0] * (5 - len(distortion)))
 
 
 def ros(what: str, by: str) -> str:
@@ -208,5 +214,5 @@ matrices = st.fixed_dictionaries({}, optional={"rows": anything, "cols": anythin
 def test_garbage_in_the_right_keys_is_a_camera_error(tmp_path: Path, values: dict[str, Any]) -> None:
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(values, allow_unicode=True), encoding="utf-8")
     with pytest.raises(CameraError) as caught:
-        read_camera(tmp_path / "own.yaml", [])
+        Camera.from_file(tmp_path / "own.yaml", [])
     assert "\n" not in str(caught.value)

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sequences import make_sevenscenes
 
-from slamdepth.datasets import open_dataset, read_camera, write_camera
-from slamdepth.datasets.camera_check import check_plausible, fold_radius, horizontal_view_deg
+from slamdepth.calibration.plausible import check_plausible, fold_radius, horizontal_view_deg
+from slamdepth.datasets import open_dataset, write_camera
 from slamdepth.datasets.readers import sevenscenes, tum
 from slamdepth.errors import CameraError
 from slamdepth.types import Camera
@@ -97,7 +97,7 @@ def test_a_very_wide_view_is_noted(tmp_path: Path, caplog: pytest.LogCaptureFixt
     path = tmp_path / "camera.yaml"
     write_camera(path, wide)
     with caplog.at_level(logging.WARNING, logger="slamdepth"):
-        assert read_camera(path) == wide
+        assert Camera.from_file(path) == wide
     said = "camera.yaml: fx 52.5 is a horizontal view of 161 degrees in an image 640 pixels wide"
     assert said in caplog.text
     write_camera(make_sevenscenes(tmp_path / "inside") / "camera.yaml", wide)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrations as OpenCV's and ROS's tools write them, in the words of ``camera.yaml``.
+"""Calibrations as OpenCV's and ROS's tools write them, translated to the keys of ``camera.yaml``.
 
 OpenCV's ``FileStorage`` writes ``camera_matrix: !!opencv-matrix {rows, cols, dt, data}`` below a line
 ``%YAML:1.0``, ROS ``camera_matrix: {rows, cols, data}`` and a ``distortion_model``; names differ a little
@@ -15,7 +15,6 @@ from typing import Any
 import yaml
 
 from slamdepth.errors import CameraError
-from slamdepth.io import parse_float
 
 _NAMES = {
     "matrix": ("cameramatrix", "k"),
@@ -27,7 +26,7 @@ _NAMES = {
     "fps": ("fps",),
     "depth_factor": ("depthfactor",),
 }
-"""What is looked for, and its names in lower case without underscores."""
+"""What is read, and its names in lower case without underscores."""
 
 _BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "brown_conrady")
 _SKEW_SHARE = 1e-6
@@ -50,12 +49,12 @@ def as_yaml(text: str) -> str:
 
 
 def is_calibration(values: dict[Any, Any]) -> bool:
-    """True where the keys of a file are those of OpenCV or ROS and not our own."""
-    return "fx" not in values and any(_plain(key) in _NAMES["matrix"] for key in values)
+    """True where the keys of a file are those of OpenCV or ROS rather than of ``camera.yaml``."""
+    return "fx" not in values and any(_normalised(key) in _NAMES["matrix"] for key in values)
 
 
 def translated(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
-    """What a calibration says, by the keys of ``camera.yaml``.
+    """The values of a calibration under the keys of ``camera.yaml``.
 
     Raises:
         CameraError: what is needed is missing, malformed or said twice, or the lens is of a model that
@@ -76,7 +75,7 @@ def translated(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
 def _find_keys(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
     keys: dict[str, Any] = {}
     for what, names in _NAMES.items():
-        given = [key for key in values if _plain(key) in names]
+        given = [key for key in values if _normalised(key) in names]
         if len(given) > 1:
             raise CameraError(f"{path}: keys {given[0]!r} and {given[1]!r} say the same; leave one")
         if given:
@@ -90,7 +89,7 @@ def _find_keys(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
     return keys
 
 
-def _plain(key: Any) -> str:
+def _normalised(key: Any) -> str:
     return str(key).lower().replace("_", "")
 
 
@@ -107,7 +106,7 @@ def _check_model(path: Path, keys: dict[str, Any], values: dict[Any, Any]) -> No
 
 def _distortion(path: Path, keys: dict[str, Any], values: dict[Any, Any]) -> list[float]:
     if "distortion" not in keys:
-        like = [key for key in values if "dist" in _plain(key) and key != keys.get("model")]
+        like = [key for key in values if "dist" in _normalised(key) and key != keys.get("model")]
         if like:
             raise CameraError(f"{path}: key {like[0]!r} is not known; write 'distortion_coefficients'")
         return [0.0] * 5
@@ -148,6 +147,8 @@ def _number(path: Path, key: Any, value: Any) -> float:
     try:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise ValueError
-        return parse_float(value) if isinstance(value, str) else float(value)  # '1e-05' is a text to YAML 1.1
+        if isinstance(value, str) and "_" in value:  # Python's 1_000, which no calibration means
+            raise ValueError
+        return float(value)  # also of text: '1e-05' is one to YAML 1.1
     except (ValueError, OverflowError) as error:
         raise CameraError(f"{path}: key {key!r} must hold numbers, found {str(value)[:40]!r}") from error

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from slamdepth.datasets import read_camera, write_camera
-from slamdepth.datasets.camera_check import check_plausible
+from slamdepth.calibration.plausible import check_plausible
 from slamdepth.errors import CameraError
+from slamdepth.io import write_camera
 from slamdepth.types import Camera
 
 RELAXED = settings(
@@ -20,10 +20,10 @@ RELAXED = settings(
 GOOD = "width: 640\nheight: 480\nfx: 500\nfy: 501.5\ncx: 320\ncy: 240\n"
 
 
-def test_defaults_are_those_of_the_issue(tmp_path: Path) -> None:
+def test_optional_keys_have_defaults(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
-    camera = read_camera(path)
+    camera = Camera.from_file(path)
     assert camera == Camera(640, 480, 500.0, 501.5, 320.0, 240.0)
     assert camera.depth_factor == 5000.0
     assert not camera.is_distorted
@@ -54,10 +54,10 @@ def test_round_trip(tmp_path: Path, camera: Camera) -> None:
     write_camera(path, camera)
     refusal = refused(camera)
     if refusal is None:
-        assert read_camera(path) == camera
+        assert Camera.from_file(path) == camera
     else:
         with pytest.raises(CameraError) as caught:
-            read_camera(path)
+            Camera.from_file(path)
         assert str(caught.value) == f"{path}: {refusal}"
 
 
@@ -86,7 +86,7 @@ def real_cameras(draw: st.DrawFn) -> Camera:
 def test_round_trip_of_plausible_cameras(tmp_path: Path, camera: Camera) -> None:
     write_camera(tmp_path / "camera.yaml", camera)
     notes: list[str] = []
-    assert read_camera(tmp_path / "camera.yaml", notes) == camera
+    assert Camera.from_file(tmp_path / "camera.yaml", notes) == camera
     assert notes == []
 
 
@@ -126,7 +126,7 @@ def test_errors_name_file_and_key(tmp_path: Path, text: str, what: str) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(text)
     with pytest.raises(CameraError) as caught:
-        read_camera(path)
+        Camera.from_file(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert what in message
@@ -135,7 +135,7 @@ def test_errors_name_file_and_key(tmp_path: Path, text: str, what: str) -> None:
 
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(CameraError, match=r"none\.yaml: cannot be read"):
-        read_camera(tmp_path / "none.yaml")
+        Camera.from_file(tmp_path / "none.yaml")
 
 
 @RELAXED
@@ -146,4 +146,16 @@ def test_garbage_is_a_camera_error(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "camera.yaml"
     path.write_bytes(data)
     with pytest.raises(CameraError):
-        read_camera(path)
+        Camera.from_file(path)
+
+
+def test_what_is_unusual_is_logged_unless_it_is_noted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_camera(tmp_path / "wide.yaml", Camera(640, 480, 50.0, 50.0, 320.0, 240.0))
+    notes: list[str] = []
+    Camera.from_file(tmp_path / "wide.yaml", notes)
+    assert not caplog.records
+    Camera.from_file(str(tmp_path / "wide.yaml"))
+    assert [record.getMessage() for record in caplog.records] == notes
+    assert "horizontal view" in notes[0]

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the intrinsics in a camera file can be those of a camera, beyond what :class:`Camera` asks.
+"""Whether the intrinsics in a camera file can be those of a camera.
 
-Cameras that the library makes itself, of cut or turned views, need not pass: only what people write does.
+Cameras that the library makes itself, of cropped or turned views, need not pass: only what people write does.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from slamdepth.errors import CameraError
-from slamdepth.types import Camera
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,21 +20,52 @@ WIDE_VIEW_DEG = 120.0
 """Wider than a pinhole camera with Brown-Conrady distortion usually sees."""
 
 _UNDONE_SHARE = 0.05
-"""Of the longer side: real lenses come back to 0.2 % of it, those whose inverse diverges to 10 % and more."""
+"""Largest error of undistorting and distorting a pixel, as a share of the longer side: 0.2 % for real
+lenses, 10 % and more where the inverse diverges."""
 
 _LEAST_REACH = 0.9
-"""Of the way to the farthest corner: fits of real lenses may turn back where the board never was."""
+"""Least share of the way to the farthest corner before distortion folds back: fits of real lenses may fold
+where the calibration board never was."""
 
 _STRONGEST, _NEGLIGIBLE = 1e4, 1e-12
-"""Bounds within which a coefficient can be reckoned with."""
+"""Coefficients of a larger magnitude are refused, smaller ones count as zero."""
 
 
-def check_plausible(camera: Camera) -> list[str]:
-    """Refuse intrinsics that no camera has, and say what is unusual, a line each.
+class Pinhole(Protocol):
+    """What is checked and written of a :class:`slamdepth.types.Camera`; see there."""
+
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def fx(self) -> float: ...
+    @property
+    def fy(self) -> float: ...
+    @property
+    def cx(self) -> float: ...
+    @property
+    def cy(self) -> float: ...
+    @property
+    def distortion(self) -> tuple[float, float, float, float, float]: ...
+    @property
+    def depth_factor(self) -> float: ...
+    @property
+    def fps(self) -> float: ...
+    @property
+    def is_distorted(self) -> bool: ...
+    def undistort_points(self, points_px: NDArray[np.floating]) -> NDArray[np.float64]: ...
+
+
+def check_plausible(camera: Pinhole) -> list[str]:
+    """Refuse intrinsics that no camera has.
+
+    Returns:
+        What is unusual about them, one line each.
 
     Raises:
         CameraError: the principal point lies outside the image, or the distortion folds it or cannot be
-            undone; without the name of the file.
+            undone; the message does not name the file.
     """
     _check_principal_point(camera)
     notes = _check_distortion(camera)
@@ -48,13 +78,13 @@ def check_plausible(camera: Camera) -> list[str]:
     return notes
 
 
-def horizontal_view_deg(camera: Camera) -> float:
+def horizontal_view_deg(camera: Pinhole) -> float:
     """Angle between the image's left and right edge in degrees, distortion left out."""
     left, right = (camera.cx + 0.5) / camera.fx, (camera.width - 0.5 - camera.cx) / camera.fx
     return math.degrees(math.atan(left) + math.atan(right))
 
 
-def fold_radius(camera: Camera) -> float:
+def fold_radius(camera: Pinhole) -> float:
     """Distance from the optical axis where radial distortion turns back, as tan of the angle in the distorted
     image; infinity where it never does."""
     k1, k2, _, _, k3 = camera.distortion
@@ -68,7 +98,7 @@ def fold_radius(camera: Camera) -> float:
     return math.sqrt(r2) * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
 
 
-def _check_principal_point(camera: Camera) -> None:
+def _check_principal_point(camera: Pinhole) -> None:
     for name, value, size, side in (
         ("cx", camera.cx, camera.width, "width"),
         ("cy", camera.cy, camera.height, "height"),
@@ -80,8 +110,8 @@ def _check_principal_point(camera: Camera) -> None:
             )
 
 
-def _check_distortion(camera: Camera) -> list[str]:
-    """What is unusual in it, a line each."""
+def _check_distortion(camera: Pinhole) -> list[str]:
+    """Refuse impossible distortion; return what is unusual about it, one line each."""
     if not camera.is_distorted:
         return []
     if max(map(abs, camera.distortion)) > _STRONGEST:
@@ -111,16 +141,16 @@ def _check_distortion(camera: Camera) -> list[str]:
     return notes
 
 
-def _named(camera: Camera) -> str:
+def _named(camera: Pinhole) -> str:
     return "distortion [" + ", ".join(f"{value:g}" for value in camera.distortion) + "] (k1 k2 p1 p2 k3)"
 
 
-def _distorted(camera: Camera, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels ``(N, 2)`` of the undistorted camera in the image as taken: Brown's model, written out."""
+def _distorted(camera: Pinhole, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Raw pixels ``(N, 2)`` of undistorted ones: Brown's model, written out."""
     x, y = ((points_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]).T
     k1, k2, p1, p2, k3 = camera.distortion
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    bent_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    return np.stack([camera.fx * bent_x + camera.cx, camera.fy * bent_y + camera.cy], axis=1)
+    distorted_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    distorted_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([camera.fx * distorted_x + camera.cx, camera.fy * distorted_y + camera.cy], axis=1)

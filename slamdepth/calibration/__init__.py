@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera files: ``camera.yaml``, and the calibrations that OpenCV and ROS write.
+
+Nothing here knows :class:`slamdepth.types.Camera`, which reads itself by :func:`read_camera`.
+"""
+
+from __future__ import annotations
+
+from slamdepth.calibration.camera_yaml import CAMERA_FILE, camera_yaml, read_camera, what_to_write
+from slamdepth.calibration.plausible import Pinhole, check_plausible
+
+__all__ = [
+    "CAMERA_FILE",
+    "Pinhole",
+    "camera_yaml",
+    "check_plausible",
+    "read_camera",
+    "what_to_write",
+]
