@@ -226,13 +226,6 @@ def test_a_blank_image_has_no_gravity() -> None:
         gravity=True,
         gravity_dim=8,
         input_px=5000,
-        token_dim=24,
-        dim=16,
-        guide_dim=8,
-        scale_dim=4,
-        gravity=True,
-        gravity_dim=8,
-        input_px=5000,
     )
     blank = replace(frame(), image_rgb=np.full((96, 128, 3), 128, np.uint8))
     blind = Dinov2Depth(tiny_backbone(), HeadEnsemble(shape).eval(), ())
