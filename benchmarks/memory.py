@@ -61,14 +61,14 @@ class TrackerMemory:
     @classmethod
     def of(cls, tracker: Tracker) -> TrackerMemory:
         """Add up the arrays in the private parts of ``tracker``, after its threads are done."""
-        tracker._between.wait()
-        landmarks, store = tracker._map, tracker._keyframes.store
+        tracker._workers.between.wait()
+        map_ = tracker._map
         return cls(
-            images=store.held_bytes / _MIB,
-            features=sum(map(_array_bytes, landmarks.keyframes)) / _MIB,
-            landmarks=_array_bytes(landmarks) / _MIB,
-            observations=tracker._log.held_bytes / _MIB,
-            on_disk=store.away_bytes / _MIB,
+            images=map_._store.resident_bytes / _MIB,
+            features=sum(map(_array_bytes, map_._states)) / _MIB,
+            landmarks=_array_bytes(map_._own) / _MIB,
+            observations=tracker._frames.size_bytes / _MIB,
+            on_disk=map_._store.spilled_bytes / _MIB,
         )
 
 

@@ -16,11 +16,11 @@ from slamdepth.config import Config
 from slamdepth.depth.alignment import log_depth_at
 from slamdepth.frontend.features import Features, create_extractor
 from slamdepth.geometry import backproject, invert, transform
+from slamdepth.loops.closer import LoopCloser
 from slamdepth.loops.places import PlaceRecogniser
-from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.mapping.map import Map
 from slamdepth.tracking.local_mapper import ray_covariance
 from slamdepth.tracking.localiser import Localiser
-from slamdepth.tracking.loop_closer import LoopCloser
 from slamdepth.types import Camera, DepthPrediction, Frame
 from slamdepth.typing import Floats32
 
@@ -103,16 +103,15 @@ def verified(places: Sequence[Place], camera: Camera, config: Config, min_gap: i
     The score is the number of inliers. Every frame is a keyframe at its true pose with the landmarks of its
     own depth; in a tracker's map it shares landmarks with its neighbours, so recall here is a lower bound.
     """
-    landmarks = LandmarkMap()
+    map_ = Map()
     config = config.model_copy(update={"loops": config.loops.model_copy(update={"min_gap": min_gap})})
-    closer = LoopCloser(config, landmarks, Localiser(camera, config, landmarks))
+    closer = LoopCloser(config, map_, Localiser(camera, config, map_))
     for k, place in enumerate(places):
-        _add(landmarks, camera, config, k, place)
-        keyframe = landmarks.keyframes[k]
-        closer.add(keyframe, closer.describe(keyframe.features))
+        _add_keyframe(map_, camera, config, place)
+        closer.places.add_vector(k, closer.describe(place.features))
 
     def answer(query: int, earlier: Sequence[int]) -> Answers:
-        keyframe = landmarks.keyframes[query]
+        keyframe = map_.keyframes[query]
         allowed = set(earlier)
         found = []
         for k in closer.candidates(keyframe):
@@ -124,7 +123,7 @@ def verified(places: Sequence[Place], camera: Camera, config: Config, min_gap: i
     return answer
 
 
-def _add(landmarks: LandmarkMap, camera: Camera, config: Config, k: int, place: Place) -> None:
+def _add_keyframe(map_: Map, camera: Camera, config: Config, place: Place) -> None:
     features = place.features
     log_depth, sigma_log = log_depth_at(place.depth, features.raw_px)
     created = np.flatnonzero(
@@ -132,17 +131,13 @@ def _add(landmarks: LandmarkMap, camera: Camera, config: Config, k: int, place: 
         & (log_depth < np.log(config.depth.max_m))
         & (sigma_log < config.depth.max_sigma_log)
     )
-    keyframe = MapKeyframe(
-        id=k,
-        frame=place.frame,
-        features=features,
-        T_camera_world=invert(place.T_world_camera),
-        point_ids=np.full(len(features), -1, dtype=np.int64),
-        log_depth=log_depth,
-        sigma_log=sigma_log,
-        prediction=place.depth,
+    keyframe = map_.add_keyframe(
+        place.frame,
+        features,
+        invert(place.T_world_camera),
+        np.full(len(features), -1, dtype=np.int64),
     )
-    landmarks.add_keyframe(keyframe)
+    map_.set_depth(keyframe, place.depth, log_depth, sigma_log)
     pinhole = camera.without_distortion()
     position_c = backproject(pinhole, features.px[created], np.exp(log_depth[created]))
     covariance_c = ray_covariance(
@@ -150,4 +145,4 @@ def _add(landmarks: LandmarkMap, camera: Camera, config: Config, k: int, place: 
     )
     R = place.T_world_camera[:3, :3]
     position_w = transform(place.T_world_camera, position_c)
-    landmarks.add_points(keyframe, created, position_w, R @ covariance_c @ R.T)
+    map_.create_landmarks(keyframe, created, position_w, R @ covariance_c @ R.T)

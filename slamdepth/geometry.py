@@ -16,6 +16,8 @@ from slamdepth.typing import Floats
 
 CHI2_2DOF_95 = 5.991
 """95 % of the squared whitened errors of a pixel are smaller: chi-square with two degrees of freedom."""
+CHI2_2DOF_99 = 9.21
+"""99 % of the squared whitened errors of a pixel are smaller."""
 
 
 def invert(T: Floats) -> Floats:

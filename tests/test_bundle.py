@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from slamdepth.backend import bundle_solver
-from slamdepth.backend.bundle import BundleProblem, bundle_adjust
+from slamdepth.backend.bundle import bundle_adjust
+from slamdepth.backend.bundle_problem import BundleProblem
 from slamdepth.backend.bundle_solver import HUBER
 from slamdepth.geometry import invert, project, rotation_angle_rad, se3_exp, transform
 from slamdepth.types import Camera

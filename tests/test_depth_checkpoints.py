@@ -31,10 +31,10 @@ from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.dinov2_heads import DptHead, LinearHead, OfficialHead
 from slamdepth.depth.dpt import BASE, LARGE, SMALL, DepthAnything, DptShape
 from slamdepth.depth.evaluate import judge_depth
+from slamdepth.depth.metric import check_metric
 from slamdepth.depth.registry import create_depth_model, depth_model_names
 from slamdepth.errors import CameraError, ConfigError, TrackingError, WeightsError
 from slamdepth.io import sha256_of
-from slamdepth.tracking.checks import check_model
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 TINY = DptShape(24, 4, 3, (0, 1, 2, 3), 16, (4, 6, 8, 10), grid=5)
@@ -184,7 +184,7 @@ def test_relative_is_never_taken_for_metric(cache: Path, tmp_path: Path) -> None
 
     model = create_depth_model("depth-anything-v2-small", weights=relative_file)
     with pytest.raises(ConfigError, match="predicts affine inverse depth; tracking needs metres"):
-        check_model(model)
+        check_metric(model)
     with_depth = replace(frame_of(), depth_m=np.full((48, 64), 2.0, np.float32))
     assert "as_predicted" not in judge_depth(model, [with_depth]).ways
     disparity = DepthPrediction(np.ones((4, 4), np.float32), model.kind)

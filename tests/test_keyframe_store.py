@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
+from benchmarks.memory import TrackerMemory
 from slamdepth.config import Config
 from slamdepth.depth.sensor import SensorDepth
-from slamdepth.mapping import landmarks
+from slamdepth.mapping import map as map_module
 from slamdepth.mapping.codec import Encoded, encode_half_precision, encode_image, encode_sensor_depth
 from slamdepth.mapping.keyframe_store import KeyframeStore, StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
@@ -40,7 +41,7 @@ def image(seed: int = 0) -> NDArray[np.uint8]:
 
 def measured(seed: int = 0) -> NDArray[np.float32]:
     raw = np.random.default_rng(seed).integers(0, 65536, (48, 64)).astype(np.uint16)
-    return raw.astype(np.float32) / np.float32(CAMERA.depth_factor)
+    return np.asarray(raw.astype(np.float32) / np.float32(CAMERA.depth_factor))
 
 
 @dataclass
@@ -225,18 +226,18 @@ def reconstruction(mib: float, change: scene.Change | None = None, model: Any = 
 
 
 def test_compacting_the_landmarks_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(landmarks, "_LEAST_ROWS", 64)
+    monkeypatch.setattr(map_module, "_COMPACT_FROM", 64)
     monkeypatch.setattr(frame_log, "_PRUNE_AT", 16)
-    results, rows, pruned_at = [], [], []
+    results, sizes, pruned_at = [], [], []
     for compact_at in (10**9, 64):
         run = scene.Run([], scene.ConstantDepth())
-        run.tracker._map._compact_at = compact_at
+        run.slam._map._compact_at = compact_at
         for frame in scene.frames(change=scene.colour_only):
             run.tracker.step(frame)
-        rows.append(run.tracker._map.size)
-        pruned_at.append(run.tracker._log._prune_at)
+        sizes.append(run.slam._map.size)
+        pruned_at.append(run.slam._frames._prune_at)
         results.append(run.finish())
-    assert rows[1] < 0.8 * rows[0]
+    assert sizes[1] < 0.8 * sizes[0]
     assert pruned_at[0] == 16 < pruned_at[1]
     sparse, compact = results
     np.testing.assert_array_equal(sparse.trajectory.T_world_camera, compact.trajectory.T_world_camera)
@@ -283,16 +284,17 @@ def test_the_memory_of_a_keyframe_and_of_a_frame_is_bounded() -> None:
         }
     )
     run = scene.Run(scene.frames(), config=config)
-    held = run.tracker.held()
+    memory = TrackerMemory.of(run.slam)
     keyframes = run.results[-1].keyframes
     assert keyframes > 10
     features = config.features.count
-    assert 0 < held.features < keyframes * features * 160
-    assert 0 < held.frames < scene.COUNT * (128 + features * 20)
-    assert held.points < 2 * 4096 * 256
+    mib = 2**20
+    assert 0 < memory.features * mib < keyframes * features * 160
+    assert 0 < memory.observations * mib < scene.COUNT * (128 + features * 20)
+    assert 0 < memory.landmarks * mib < 2 * 4096 * 256
     newest = 8 * 320 * 240 * (3 + 4)
-    assert held.images == newest
-    assert 0 < held.on_disk < (keyframes - 8) * 320 * 240 * 3
+    assert memory.images * mib == newest
+    assert 0 < memory.on_disk * mib < (keyframes - 8) * 320 * 240 * 3
 
 
 def test_going_back_and_forth_makes_few_keyframes() -> None:

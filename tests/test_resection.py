@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A second start for an adjustment: what sees much places what sees little."""
+"""A second start for an adjustment: cameras that see much re-register those that see little."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from tracking_scene import ConstantDepth, Run, colour_only, frames
 
-from slamdepth.backend.bundle import BundleProblem, bundle_adjust
-from slamdepth.backend.resection import placed_anew
+from slamdepth.backend.bundle import bundle_adjust
+from slamdepth.backend.bundle_problem import BundleProblem
+from slamdepth.backend.resection import multi_start
 from slamdepth.config import Config
 from slamdepth.geometry import invert, project, rotation_angle_rad, se3_exp, transform
-from slamdepth.mapping.keyframe_store import StoredFrame
-from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
-from slamdepth.tracking import map_adjuster
-from slamdepth.tracking.map_adjuster import MapAdjuster
-from slamdepth.tracking.shutter import Shutter
-from slamdepth.tracking.side_thread import SideThread
+from slamdepth.mapping.map import Map
+from slamdepth.tracking import adjuster
+from slamdepth.tracking.adjuster import Adjuster
+from slamdepth.tracking.rolling_shutter import RollingShutter
+from slamdepth.tracking.workers import Worker
 from slamdepth.types import Camera, Frame
 
 CAMERA = Camera(640, 480, 520.0, 510.0, 319.0, 241.0)
@@ -27,7 +27,7 @@ COUNT = 14
 
 
 def truth(seed: int = 0) -> BundleProblem:
-    """Cameras side by side, the first fixed: five see 40 points of a cloud, the others some 300."""
+    """Cameras in a row, the first fixed: five see 40 points of a cloud, the others some 300."""
     rng = np.random.default_rng(seed)
     X = rng.uniform((-1.6, -1.0, 2.0), (3.2, 1.0, 4.0), (900, 3))
     step = np.array([-0.12, 0.01, 0.0, 0.0, -0.01, 0.0])
@@ -55,9 +55,11 @@ def truth(seed: int = 0) -> BundleProblem:
     )
 
 
-def bent(exact: BundleProblem, degrees: float = 15.0) -> BundleProblem:
-    """The weak cameras turned and pushed aside, as if the map had been begun wrongly: the first one stays, so
-    all others and the points are where those say."""
+def wrongly_started(exact: BundleProblem, degrees: float = 15.0) -> BundleProblem:
+    """The weak cameras turned and shifted against the rest, as after a wrong start of the map.
+
+    The first camera stays, so all others and the points are displaced.
+    """
     T = exact.T_camera_world.copy()
     wrong = se3_exp(np.array([0.2, 0.0, 0.3, 0.0, np.deg2rad(degrees), 0.0]))
     for k in range(WEAK, COUNT):
@@ -72,31 +74,31 @@ def errors(T: np.ndarray, T_true: np.ndarray) -> np.ndarray:
     D = relative.copy()
     D[:, :3, 3] *= factor
     D = D @ invert(true)
-    return np.maximum(rotation_angle_rad(D[:, :3, :3]), np.linalg.norm(D[:, :3, 3], axis=1))
+    return np.asarray(np.maximum(rotation_angle_rad(D[:, :3, :3]), np.linalg.norm(D[:, :3, 3], axis=1)))
 
 
-def test_cameras_that_see_little_are_put_right() -> None:
+def test_cameras_that_see_little_are_re_registered() -> None:
     exact = truth()
-    wrong = bent(exact)
+    wrong = wrongly_started(exact)
     assert errors(wrong.T_camera_world, exact.T_camera_world).max() > 0.2
-    found = placed_anew(wrong)
+    found = multi_start(wrong)
     assert found is not None
     assert errors(found.T_camera_world, exact.T_camera_world).max() < 1e-3
     np.testing.assert_array_equal(found.T_camera_world[0], wrong.T_camera_world[0])  # the fixed one
-    # points came along: nothing is left to adjust
+    # points moved along: nothing is left to adjust
     seen = np.unique(exact.obs_point)
     assert bundle_adjust(found, (1,)).initial_cost < 1e-2 * len(seen)
 
 
-def test_a_good_start_is_left_alone() -> None:
+def test_a_good_start_is_kept() -> None:
     exact = truth()
-    assert placed_anew(exact) is None
+    assert multi_start(exact) is None
     noise = np.random.default_rng(1).normal(0, 0.5, exact.px.shape)
-    assert placed_anew(replace(exact, px=exact.px + noise)) is None
+    assert multi_start(replace(exact, px=exact.px + noise)) is None
 
 
 def test_cameras_that_all_see_much_need_no_other_start() -> None:
-    exact = bent(truth())
+    exact = wrongly_started(truth())
     strong = exact.obs_camera >= WEAK
     only = replace(
         exact,
@@ -109,11 +111,11 @@ def test_cameras_that_all_see_much_need_no_other_start() -> None:
         log_depth=exact.log_depth[strong],
         sigma_log=exact.sigma_log[strong],
     )
-    assert placed_anew(only) is None
+    assert multi_start(only) is None
 
 
-def test_a_camera_that_cannot_be_placed_moves_with_its_neighbour() -> None:
-    wrong = bent(truth())
+def test_a_camera_that_cannot_be_registered_moves_with_its_neighbour() -> None:
+    wrong = wrongly_started(truth())
     lonely = wrong.obs_camera != 2
     keep = lonely | (np.cumsum(~lonely) <= 8)  # eight observations are left to camera 2
     few = replace(
@@ -125,21 +127,21 @@ def test_a_camera_that_cannot_be_placed_moves_with_its_neighbour() -> None:
         log_depth=wrong.log_depth[keep],
         sigma_log=wrong.sigma_log[keep],
     )
-    found = placed_anew(few)
+    found = multi_start(few)
     assert found is not None
     was = few.T_camera_world[2] @ invert(few.T_camera_world[1])
     now = found.T_camera_world[2] @ invert(found.T_camera_world[1])
     np.testing.assert_allclose(now, was, atol=1e-9)
 
 
-def test_wrong_matches_do_not_place_a_camera() -> None:
+def test_wrong_matches_do_not_register_a_camera() -> None:
     exact = truth()
-    wrong = bent(exact)
+    wrong = wrongly_started(exact)
     rng = np.random.default_rng(2)
     mine = np.flatnonzero(wrong.obs_camera == 3)
     px = wrong.px.copy()
     px[mine] = rng.uniform((0, 0), (640, 480), (len(mine), 2))
-    found = placed_anew(replace(wrong, px=px))
+    found = multi_start(replace(wrong, px=px))
     assert found is not None
     others = np.arange(COUNT) != 3
     assert errors(found.T_camera_world, exact.T_camera_world)[others].max() < 1e-3
@@ -147,15 +149,15 @@ def test_wrong_matches_do_not_place_a_camera() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_same_problem_gives_the_same_start(seed: int) -> None:
-    wrong = bent(truth(seed))
-    one, other = placed_anew(wrong), placed_anew(wrong)
+    wrong = wrongly_started(truth(seed))
+    one, other = multi_start(wrong), multi_start(wrong)
     assert one is not None
     assert other is not None
     np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
     np.testing.assert_array_equal(one.points_w, other.points_w)
 
 
-def test_nothing_to_place() -> None:
+def test_nothing_to_register() -> None:
     exact = truth()
     nothing = np.zeros(0, dtype=np.int64)
     empty = replace(
@@ -167,7 +169,7 @@ def test_nothing_to_place() -> None:
         log_depth=np.zeros(0),
         sigma_log=np.zeros(0),
     )
-    assert placed_anew(empty) is None
+    assert multi_start(empty) is None
 
 
 @dataclass
@@ -178,71 +180,67 @@ class Seen:
     octave: np.ndarray
 
 
-def map_of(problem: BundleProblem) -> LandmarkMap:
-    landmarks = LandmarkMap()
-    row_of = np.full(len(problem.points_w), -1, dtype=np.int64)
+def map_of(problem: BundleProblem) -> Map:
+    map_ = Map()
+    id_of = np.full(len(problem.points_w), -1, dtype=np.int64)
     for k, T in enumerate(problem.T_camera_world):
         at = np.flatnonzero(problem.obs_camera == k)
         n, point = len(at), problem.obs_point[at]
         features = Seen(problem.px[at], np.ones(n), np.zeros((n, 32), np.uint8), np.zeros(n, np.int64))
-        frame = StoredFrame(Frame(k, k / 30, np.zeros((480, 640, 3), np.uint8), CAMERA))
-        known = row_of[point]
-        unsure = np.full(n, np.nan)
-        keyframe = MapKeyframe(k, frame, features, T.copy(), known.copy(), unsure, unsure.copy())
-        landmarks.keyframes.append(keyframe)
+        frame = Frame(k, k / 30, np.zeros((480, 640, 3), np.uint8), CAMERA)
+        known = id_of[point]
+        keyframe = map_.add_keyframe(frame, features, T, known)
         new = np.flatnonzero(known < 0)
-        rows = landmarks.add_points(
+        id_of[point[new]] = map_.create_landmarks(
             keyframe, new, problem.points_w[point[new]], np.tile(np.eye(3), (len(new), 1, 1))
         )
-        row_of[point[new]] = rows
-        landmarks.observations[known[known >= 0]] += 1
-    return landmarks
+    return map_
 
 
-def reconsidered(problem: BundleProblem) -> tuple[bool, np.ndarray]:
-    landmarks, config = map_of(problem), Config()
-    side = SideThread()
-    adjuster = MapAdjuster(CAMERA, config, landmarks, Shutter(CAMERA, config.shutter, landmarks), side)
-    is_better = adjuster.reconsider(list(range(COUNT)), landmarks.seen_by(2), (5, 5))
+def adjusted_from_two_starts(problem: BundleProblem) -> tuple[bool, np.ndarray]:
+    map_, config = map_of(problem), Config()
+    side = Worker("side")
+    two_starts = Adjuster(CAMERA, config, map_, RollingShutter(CAMERA, config.shutter, map_), side)
+    is_better = two_starts.adjust_from_two_starts(list(range(COUNT)), map_.seen_by(2), (5, 5))
     side.close()
-    return is_better, np.stack([k.T_camera_world for k in landmarks.keyframes])
+    return is_better, np.stack([k.T_camera_world for k in map_.keyframes])
 
 
 def test_the_map_takes_over_what_fits_better() -> None:
     exact = truth()
-    is_better, T = reconsidered(bent(exact))
+    is_better, T = adjusted_from_two_starts(wrongly_started(exact))
     assert is_better
     assert errors(T, exact.T_camera_world).max() < 1e-3
 
 
 def test_the_map_keeps_what_fits_as_well() -> None:
     exact = truth()
-    is_better, T = reconsidered(exact)
+    is_better, T = adjusted_from_two_starts(exact)
     assert not is_better
     np.testing.assert_array_equal(T, exact.T_camera_world)
 
 
 def test_another_start_that_ends_no_better_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     exact = truth()
-    monkeypatch.setattr(map_adjuster, "placed_anew", lambda problem: bent(problem, 2.0))
-    is_better, T = reconsidered(exact)
+    monkeypatch.setattr(adjuster, "multi_start", lambda problem: wrongly_started(problem, 2.0))
+    is_better, T = adjusted_from_two_starts(exact)
     assert not is_better
     np.testing.assert_array_equal(T, exact.T_camera_world)
 
 
-def test_another_start_is_told_and_only_asked_for_with_predicted_depth(
+def test_another_start_is_noted_and_only_tried_with_predicted_depth(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked: list[int] = []
+    tried: list[int] = []
 
-    def reconsider(self: MapAdjuster, window: list[int], *rest: object) -> bool:
-        asked.append(len(window))
+    def adjust_from_two_starts(self: Adjuster, window: list[int], *rest: object) -> bool:
+        tried.append(len(window))
         return True
 
-    monkeypatch.setattr(MapAdjuster, "reconsider", reconsider)
+    monkeypatch.setattr(Adjuster, "adjust_from_two_starts", adjust_from_two_starts)
     given = frames(range(24), change=colour_only)
     notes = Run(given, ConstantDepth()).finish().notes
-    assert len(asked) == 1
-    assert any("placed anew" in note for note in notes)
-    assert not any("placed anew" in note for note in Run(frames(range(24))).finish().notes)
-    assert len(asked) == 1
+    assert len(tried) == 1
+    assert any("re-registered" in note for note in notes)
+    assert not any("re-registered" in note for note in Run(frames(range(24))).finish().notes)
+    assert len(tried) == 1

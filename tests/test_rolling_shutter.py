@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera that reads its rows one after the other while it moves."""
+"""A rolling shutter: rows are exposed one after the other while the camera moves."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from slamdepth.depth.sensor import SensorDepth
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.rolling_shutter import at_middle_row, px_per_readout_s, row_phase, velocity_between
 from slamdepth.geometry import backproject, invert, project, se3_exp, so3_exp, transform
-from slamdepth.mapping.landmarks import LandmarkMap, MapKeyframe
+from slamdepth.mapping.map import Map
+from slamdepth.mapping.placement import Placement
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.tracking import create_tracker
 from slamdepth.tracking.frame_log import FrameLog
-from slamdepth.tracking.localiser import Placement
-from slamdepth.tracking.shutter import Shutter
+from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.types import Camera, Frame
 
 PINHOLE = Camera(640, 480, 520.0, 510.0, 319.0, 241.0)
@@ -61,16 +61,16 @@ def seen_rolling(
 @settings(max_examples=25, deadline=None)
 def test_rolling_pixels_go_back_to_where_the_middle_row_saw_them(velocity: NDArray[np.float64]) -> None:
     rng = np.random.default_rng(0)
-    still = rng.uniform((40, 40), (600, 440), (8, 2))
+    corrected = rng.uniform((40, 40), (600, 440), (8, 2))
     z = rng.uniform(0.8, 4.0, 8)
-    rolling = seen_rolling(velocity, backproject(PINHOLE, still, z), READOUT_S)
+    rolling = seen_rolling(velocity, backproject(PINHOLE, corrected, z), READOUT_S)
     # the depth in the row's own camera differs by millimetres, which is of second order
     back = at_middle_row(PINHOLE, rolling, row_phase(rolling, PINHOLE), 1.0 / z, velocity, READOUT_S)
-    off = np.linalg.norm(rolling - still, axis=1)
-    assert np.linalg.norm(back - still, axis=1).max() < 0.02 + 0.05 * off.max()
+    off = np.linalg.norm(rolling - corrected, axis=1)
+    assert np.linalg.norm(back - corrected, axis=1).max() < 0.02 + 0.05 * off.max()
 
 
-def test_a_still_camera_and_a_global_shutter_change_nothing() -> None:
+def test_a_camera_at_rest_and_a_global_shutter_change_nothing() -> None:
     px = np.array([[10.0, 20.0], [600.0, 470.0]])
     phase, near = row_phase(px, PINHOLE), np.ones(2)
     np.testing.assert_allclose(at_middle_row(PINHOLE, px, phase, near, np.zeros(6), 0.03), px)
@@ -129,18 +129,20 @@ def test_the_rate_is_the_derivative() -> None:
 def test_a_readout_time_is_kept_where_it_is_certain_and_possible(
     change_s: float, sigma_s: float, readout_s: float
 ) -> None:
-    shutter = Shutter(PINHOLE, ShutterConfig(), LandmarkMap())
-    assert shutter.learn(change_s, sigma_s) is (readout_s != 0)
+    shutter = RollingShutter(PINHOLE, ShutterConfig(), Map())
+    assert shutter.update(change_s, sigma_s) is (readout_s != 0)
     assert shutter.readout_s == pytest.approx(readout_s)
-    assert shutter.rolls is (readout_s != 0)
+    assert shutter.is_active is (readout_s != 0)
 
 
-def test_a_given_readout_time_is_not_sought() -> None:
-    shutter = Shutter(PINHOLE, ShutterConfig(readout_ms=18.0), LandmarkMap())
-    assert shutter.readout_s == pytest.approx(0.018)
-    assert not shutter.is_due(1000)
-    sought = Shutter(PINHOLE, ShutterConfig(), LandmarkMap())
-    assert [n for n in range(1, 40) if sought.is_due(n)] == [10, 15, 22, 33]
+def test_a_given_readout_time_is_not_estimated() -> None:
+    given = RollingShutter(PINHOLE, ShutterConfig(readout_ms=18.0), Map())
+    assert given.readout_s == pytest.approx(0.018)
+    assert not given.is_estimated
+    assert not given.is_due(1000)
+    unknown = RollingShutter(PINHOLE, ShutterConfig(), Map())
+    assert unknown.is_estimated
+    assert [n for n in range(1, 40) if unknown.is_due(n)] == [10, 15, 22, 33]
 
 
 def tracked(frames: list[Frame], config: Config = CONFIG) -> Reconstruction:
@@ -148,7 +150,7 @@ def tracked(frames: list[Frame], config: Config = CONFIG) -> Reconstruction:
 
 
 def upright(frame: Frame) -> Frame:
-    """The rolling frames taken by an upright camera, turned a quarter to the left."""
+    """The frame as a camera held upright takes it, turned a quarter to the left."""
     camera = replace(
         CAMERA,
         width=CAMERA.height,
@@ -159,8 +161,12 @@ def upright(frame: Frame) -> Frame:
         cy=CAMERA.width - 1 - CAMERA.cx,
     )
     assert frame.depth_m is not None
-    image, depth = (np.ascontiguousarray(np.rot90(array)) for array in (frame.image_rgb, frame.depth_m))
-    return replace(frame, image_rgb=image, depth_m=depth, camera=camera)
+    return replace(
+        frame,
+        image_rgb=np.ascontiguousarray(np.rot90(frame.image_rgb)),
+        depth_m=np.ascontiguousarray(np.rot90(frame.depth_m)),
+        camera=camera,
+    )
 
 
 _SHAKE_RAD, _SHAKE_HZ = np.radians(2.5), 1.7
@@ -178,12 +184,13 @@ def shaken(frame: Frame, readout_s: float) -> Frame:
     image = cv2.remap(frame.image_rgb, at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     assert frame.depth_m is not None
     depth = cv2.remap(frame.depth_m, at_u, at_v, cv2.INTER_NEAREST, borderValue=0) / rays[..., 2]
-    return replace(frame, image_rgb=image, depth_m=depth.astype(np.float32))
+    return replace(frame, image_rgb=np.asarray(image, np.uint8), depth_m=depth.astype(np.float32))
 
 
 def _shake(t: NDArray[np.float64]) -> NDArray[np.float64]:
     phase = 2 * np.pi * _SHAKE_HZ * t
-    return _SHAKE_RAD * np.stack([np.sin(phase), np.cos(1.3 * phase), 0.6 * np.sin(0.7 * phase + 1)], -1)
+    turns = np.stack([np.sin(phase), np.cos(1.3 * phase), 0.6 * np.sin(0.7 * phase + 1)], -1)
+    return np.asarray(_SHAKE_RAD * turns)
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +204,7 @@ def found(rolling_frames: list[Frame]) -> Reconstruction:
     return tracked(rolling_frames)
 
 
-def test_the_readout_time_is_found_and_the_trajectory_better_for_it(
+def test_estimating_the_readout_time_improves_the_trajectory(
     rolling_frames: list[Frame], found: Reconstruction
 ) -> None:
     assert found.statistics.readout_sigma_s is not None
@@ -230,7 +237,7 @@ def test_a_global_shutter_is_recognised() -> None:
 
 @pytest.mark.parametrize("cut", [30, 44])
 def test_a_cut_in_the_recording_is_no_motion(rolling_frames: list[Frame], cut: int) -> None:
-    """By the velocity of a leap from one place to another all rows would be elsewhere."""
+    """The velocity of a jump from one place to another would displace all rows."""
     config = Config.from_dict({**CONFIG.model_dump(), "shutter": {"readout_ms": 1e3 * READOUT_S}})
     run = Run(played([*rolling_frames[:cut], *rolling_frames[:16]]), SensorDepth(), config)
     for before, after in zip(run.results[:16], run.results[cut:], strict=True):
@@ -241,29 +248,24 @@ def test_a_cut_in_the_recording_is_no_motion(rolling_frames: list[Frame], cut: i
     np.testing.assert_allclose(made[cut:], made[:16], atol=0.03)
 
 
-def test_a_reregistered_frame_is_as_fast_as_the_frames_after_it() -> None:
+def test_a_frame_that_no_motion_leads_to_is_as_fast_as_the_frames_after_it() -> None:
     """It was placed without a velocity, so its own place is not to be trusted for one."""
-    landmarks = LandmarkMap()
-    log = FrameLog(PINHOLE, landmarks)
+    map_ = Map()
+    log = FrameLog(PINHOLE, map_)
     velocity = np.array([0.3, -0.1, 0.2, 0.1, 0.2, -0.3])
     off = se3_exp(np.array([0.03, 0.02, 0.0, 0.0, 0.02, 0.0]))
     for n in range(3):
         T_camera_world = invert(moved(velocity, n / 30))
         if n == 0:
             T_camera_world = off @ T_camera_world
-            landmarks.keyframes.append(empty_keyframe(T_camera_world))
+            frame = Frame(0, 0.0, np.zeros((480, 640, 3), np.uint8), PINHOLE)
+            map_.add_keyframe(frame, no_features(), T_camera_world, np.zeros(0, np.int64))
         placement = Placement(T_camera_world, np.zeros(0, np.int64))
-        log.add(n / 30, no_features(), placement, n == 0, is_found_anew=n == 0)
+        log.add(n / 30, no_features(), placement, n == 0, follows_motion=n != 0)
     log.refresh_velocities()
-    np.testing.assert_allclose(landmarks.keyframes[0].velocity, velocity, atol=0.01)
+    np.testing.assert_allclose(map_.keyframes[0].velocity, velocity, atol=0.01)
 
 
 def no_features() -> Features:
-    nothing = np.zeros((0, 2), np.float32)
+    nothing = np.zeros((0, 2))
     return Features(nothing, nothing, np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 32), np.uint8))
-
-
-def empty_keyframe(T_camera_world: NDArray[np.float64]) -> MapKeyframe:
-    frame = Frame(0, 0.0, np.zeros((480, 640, 3), np.uint8), PINHOLE)
-    nothing = np.zeros(0)
-    return MapKeyframe(0, frame, no_features(), T_camera_world, np.zeros(0, np.int64), nothing, nothing)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from tracking_scene import (
     colour_only,
     frames,
     grey,
+    poses_of,
     truth_of,
     walk,
 )
@@ -27,12 +27,13 @@ from slamdepth.depth.robust_centre import robust_centre
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import CameraError, ConfigError, TrackingError
 from slamdepth.geometry import invert, rotation_angle_rad, transform
+from slamdepth.mapping.map import MapKeyframe
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.tracking import CloudTracker, Tracker, create_tracker
-from slamdepth.tracking.map_adjuster import MapAdjuster
+from slamdepth.tracking.adjuster import Adjuster, Adjustment
 from slamdepth.types import DepthKind, DepthPrediction, Frame, TrackingStatus
 
-DOWN_W = np.array([0.1, 0.9, 0.3]) / np.linalg.norm([0.1, 0.9, 0.3])
+GRAVITY_W = np.array([0.1, 0.9, 0.3]) / np.linalg.norm([0.1, 0.9, 0.3])
 
 
 @pytest.fixture(scope="module")
@@ -102,22 +103,22 @@ def test_the_reconstruction_is_consistent(
         assert made.statistics.timing_calls["final"] == 1
 
 
-class ToldDown(ConstantDepth):
-    """Finds ``DOWN_W`` in each image, as the true camera would see it."""
+class WithGravity(ConstantDepth):
+    """Estimates ``GRAVITY_W`` in each image, as the true camera would see it."""
 
     def predict(self, frame: Frame) -> DepthPrediction:
         R_world_camera = walk()[1][frame.index][:3, :3]
-        return replace(super().predict(frame), gravity=R_world_camera.T @ DOWN_W, gravity_share=0.8)
+        return replace(super().predict(frame), gravity=R_world_camera.T @ GRAVITY_W, gravity_share=0.8)
 
 
-def test_gravity_that_the_images_told_is_handed_on_in_the_world(
+def test_gravity_estimated_in_the_images_is_passed_on_in_the_world(
     sensor_run: tuple[Run, Reconstruction], constant_run: tuple[Run, Reconstruction]
 ) -> None:
-    made = Run(frames(change=colour_only), ToldDown()).finish()
+    made = Run(frames(change=colour_only), WithGravity()).finish()
     assert made.gravity_w is not None
     assert np.linalg.norm(made.gravity_w) == pytest.approx(1.0)
-    assert made.gravity_w @ DOWN_W > np.cos(np.radians(1.0))
-    np.testing.assert_array_equal(  # a model that does not listen: nothing else may change
+    assert made.gravity_w @ GRAVITY_W > np.cos(np.radians(1.0))
+    np.testing.assert_array_equal(  # the model makes no use of it: nothing else may change
         made.trajectory.T_world_camera, constant_run[1].trajectory.T_world_camera
     )
     assert sensor_run[1].gravity_w is constant_run[1].gravity_w is None
@@ -135,12 +136,12 @@ def test_steps_say_what_was_done(sensor_run: tuple[Run, Reconstruction]) -> None
     totals = [r.keyframes for r in run.results]
     assert sum("bundle" in r.timings_ms for r in run.results) >= totals[-1] - 2
     assert totals == sorted(totals)
-    online = np.stack([r.T_world_camera for r in run.results])
+    online = poses_of(run.results)
     assert np.linalg.norm(online[:, :3, 3] - walk()[1][:, :3, 3], axis=1).max() < 0.04
 
 
-def test_map_points_lie_on_the_surfaces(sensor_run: tuple[Run, Reconstruction]) -> None:
-    """Seen from the true cameras, most points are where the depth images say."""
+def test_landmarks_lie_on_the_surfaces(sensor_run: tuple[Run, Reconstruction]) -> None:
+    """Seen from the true cameras, most landmarks are where the depth images say."""
     _, made = sensor_run
     frame, T_world_camera = walk()[0][0], walk()[1][0]
     P = transform(invert(T_world_camera), made.points_m)
@@ -153,12 +154,13 @@ def test_map_points_lie_on_the_surfaces(sensor_run: tuple[Run, Reconstruction]) 
     assert np.median(error) < 0.01
 
 
-def test_the_constant_prior_was_bent_to_the_scene(constant_run: tuple[Run, Reconstruction]) -> None:
-    """The map's points correct the prediction: the final depth is nearer the truth, up to one scale."""
+def test_the_constant_prior_was_aligned_to_the_scene(constant_run: tuple[Run, Reconstruction]) -> None:
+    """Landmarks correct the prediction: the final depth is nearer the truth, up to one scale."""
     _, made = constant_run
     spread = []
     for k in made.keyframes[1:]:
         truth = walk()[0][k.frame.index].depth_m
+        assert truth is not None
         before, after = np.log(k.prediction.load().values / truth), np.log(k.load_depth_m() / truth)
         spread.append((before.std(), after.std()))
     before, after = np.mean(spread, axis=0)
@@ -264,25 +266,27 @@ def test_the_network_runs_on_keyframes_only() -> None:
     assert model.calls == run.results[-1].keyframes
 
 
-def test_what_a_network_says_of_its_errors_can_be_kept_back() -> None:
-    def trajectory(sigma_log: float, *, is_heard: bool) -> np.ndarray:
-        config = Config.from_dict({**CONFIG.model_dump(), "depth": {"uncertainty": is_heard}})
+def test_what_a_network_says_of_its_errors_can_be_ignored() -> None:
+    def trajectory(sigma_log: float, *, is_used: bool) -> np.ndarray:
+        config = Config.from_dict({**CONFIG.model_dump(), "depth": {"uncertainty": is_used}})
         run = Run(frames(range(30), change=colour_only), ConstantDepth(sigma_log=sigma_log), config)
         return run.finish().trajectory.T_world_camera
 
-    np.testing.assert_array_equal(trajectory(0.1, is_heard=False), trajectory(0.45, is_heard=False))
-    assert not np.array_equal(trajectory(0.1, is_heard=True), trajectory(0.45, is_heard=True))
+    np.testing.assert_array_equal(trajectory(0.1, is_used=False), trajectory(0.45, is_used=False))
+    assert not np.array_equal(trajectory(0.1, is_used=True), trajectory(0.45, is_used=True))
 
 
-def test_windows_can_be_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_local_adjustment_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[int] = []
-    begin = MapAdjuster.begin
+    begin_window = Adjuster.begin_window
 
-    def counted(self: MapAdjuster, window: list[int], *rest: Any) -> Any:
-        begun.append(len(window))
-        return begin(self, window, *rest)
+    def counted(self: Adjuster, keyframe: MapKeyframe) -> Adjustment | None:
+        adjustment = begin_window(self, keyframe)
+        if adjustment is not None:
+            begun.append(keyframe.id)
+        return adjustment
 
-    monkeypatch.setattr(MapAdjuster, "begin", counted)
+    monkeypatch.setattr(Adjuster, "begin_window", counted)
     for is_local in (True, False):
         begun.clear()
         config = Config.from_dict({**CONFIG.model_dump(), "bundle": {"local": is_local, "final": False}})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tracker with other features than ORB: it must not notice."""
+"""The tracker with other features than ORB."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_sift_with_a_constant_prior_tracks_every_frame_up_to_scale() -> None:
     assert ate_m(run.finish().trajectory, with_scale=True) < 0.02
 
 
-def test_a_lost_camera_finds_its_place_by_orb_descriptors() -> None:
+def test_a_lost_camera_is_relocalised_by_visual_words_of_orb_descriptors() -> None:
     """Both lenses are covered, and then the camera is back at the fourth frame."""
 
     def hidden(frame: Frame) -> Frame:

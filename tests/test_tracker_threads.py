@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What runs beside the tracker: however slow it is, the result is the same."""
+"""What runs in parallel to the tracker: however slow it is, the result is the same."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 from tracking_scene import CAMERA, CONFIG, COUNT, ConstantDepth, Run, ate_m, colour_only, frames
 
-from slamdepth.backend.bundle import BundleResult
+from slamdepth.backend.bundle_problem import BundleResult
 from slamdepth.config import Config
 from slamdepth.errors import CameraError
 from slamdepth.geometry import invert, se3_exp, so3_exp, transform
-from slamdepth.mapping.landmarks import MapKeyframe
+from slamdepth.mapping.map import Map
+from slamdepth.mapping.placement import Placement
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.tracking import Tracker, side_thread
-from slamdepth.tracking.keyframes import Moved
-from slamdepth.tracking.threads import single_threaded
+from slamdepth.thread_limits import single_threaded
+from slamdepth.tracking import Tracker, workers
+from slamdepth.tracking.motion import MotionModel
 from slamdepth.types import DepthPrediction, Frame, TrackingStatus
 
 
@@ -68,17 +69,17 @@ def test_a_slow_network_changes_nothing(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_slow_work_beside_changes_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Adjustments, readout times, words and the growing map are taken at frames, however slow they are."""
+def test_slow_threads_change_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Adjustments, readout times, visual words and the growing map are taken over at counted frames."""
     _, expected = prompt()
-    random, at_once, names = np.random.default_rng(seed), side_thread._alone, set()
+    random, at_once, names = np.random.default_rng(seed), workers._single_threaded, set()
 
     def late(task: Callable[[], Any]) -> Any:
         names.add(threading.current_thread().name)
         time.sleep(random.uniform(0.0, 0.2))
         return at_once(task)
 
-    monkeypatch.setattr(side_thread, "_alone", late)
+    monkeypatch.setattr(workers, "_single_threaded", late)
     made = Run(frames(change=colour_only), LateDepth(0, 0.0)).finish()
     assert names == {"slamdepth-side_0", "slamdepth-between_0"}
     np.testing.assert_array_equal(made.trajectory.T_world_camera, expected.trajectory.T_world_camera)
@@ -87,28 +88,28 @@ def test_slow_work_beside_changes_nothing(seed: int, monkeypatch: pytest.MonkeyP
 
 def test_a_keyframe_made_while_a_window_is_adjusted_moves_along() -> None:
     run = Run(frames(range(60), colour_only), LateDepth(0, 0.0))
-    landmarks, adjuster, mapper = run.tracker._map, run.tracker._adjuster, run.tracker._mapper
-    run.tracker._join()
-    newest = landmarks.keyframes[-1]
-    adjustment = mapper.begin_window(newest)
+    map_, integration = run.slam._map, run.slam._integration
+    run.slam._workers.between.wait()
+    integration.run_all()
+    newest = map_.keyframes[-1]
+    adjustment = integration.adjuster.begin_window(newest)
     assert adjustment is not None
     solved = adjustment.result.result()
     T_made = se3_exp(np.array([0.1, 0.0, 0.0, 0.0, 0.05, 0.0])) @ newest.T_camera_world
-    points = newest.point_ids.copy()
-    made = mapper.insert(newest.frame, newest.features, T_made, points, np.zeros(6))
+    made = map_.add_keyframe(newest.frame.load(), newest.features, T_made, newest.landmark_ids)
     T_made_newest = T_made @ newest.T_world_camera
     shift = se3_exp(np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.03]))
     moved = solved.T_camera_world @ shift
     done: Future[BundleResult] = Future()
     done.set_result(replace(solved, T_camera_world=moved, points_w=transform(invert(shift), solved.points_w)))
-    before = newest.T_camera_world.copy()
-    adjuster.complete(replace(adjustment, result=done))
+    before = newest.T_camera_world
+    integration.adjuster.complete(replace(adjustment, result=done))
     assert np.abs(newest.T_camera_world - before).max() > 0.01
     np.testing.assert_allclose(made.T_camera_world @ newest.T_world_camera, T_made_newest, atol=1e-12)
 
 
 class Inside:
-    """A thread that is inside ``single_threaded`` until it is told to leave."""
+    """A thread that is inside ``single_threaded`` until it is asked to leave."""
 
     def __init__(self) -> None:
         self._inside, self._leave = threading.Event(), threading.Event()
@@ -128,7 +129,7 @@ class Inside:
         self._thread.join()
 
 
-def test_the_number_of_threads_is_set_back_by_the_last_to_leave() -> None:
+def test_the_last_to_leave_restores_the_number_of_threads() -> None:
     cv2.setNumThreads(2)
     other = Inside()
     with single_threaded():
@@ -146,8 +147,8 @@ def numbers_of_threads() -> list[int]:
 
 
 @pytest.mark.parametrize("first_to_leave", [0, 1])
-def test_whoever_enters_first_and_leaves_last_only_one_thread_computes(first_to_leave: int) -> None:
-    """By its number of threads OpenBLAS sums in another order: trajectories would differ in the last bits."""
+def test_one_thread_computes_whoever_enters_first_and_leaves_last(first_to_leave: int) -> None:
+    """OpenBLAS sums in an order that depends on its threads: trajectories would differ in the last bits."""
     import scipy.linalg  # noqa: F401
 
     cv2.setNumThreads(2)
@@ -185,15 +186,17 @@ def test_depth_may_be_late_by_any_number_of_frames(late: int) -> None:
     run = Run(frames(change=colour_only), model, delayed(late))
     assert run.statuses() == {TrackingStatus.TRACKING: COUNT}
     keyframes = [r.index for r in run.results if r.is_keyframe]
-    born = [r.index for r in run.results if "depth" in r.timings_ms]
+    with_depth = [r.index for r in run.results if "depth" in r.timings_ms]
     adjusted = [r.index for r in run.results if "bundle" in r.timings_ms]
-    assert keyframes[0] == born[0] == adjusted[0] == 0  # nothing to track on before the first one's depth
-    for keyframe, joined in zip(keyframes, born, strict=False):
+    assert (
+        keyframes[0] == with_depth[0] == adjusted[0] == 0
+    )  # nothing to track on before the first one's depth
+    for keyframe, joined in zip(keyframes, with_depth, strict=False):
         # its own delay, and two frames for what is left of the keyframe before
         assert keyframe <= joined <= keyframe + max(late, 1) + 2
-    for joined, third in zip(born, keyframes[2:], strict=False):
+    for joined, third in zip(with_depth, keyframes[2:], strict=False):
         assert joined <= third  # two wait at a time
-    assert len(born) >= len(keyframes) - 2
+    assert len(with_depth) >= len(keyframes) - 2
     made = run.finish()
     assert len(made.keyframes) == model.calls == len(keyframes)
     assert all(k.prediction is not None for k in made.keyframes)
@@ -212,7 +215,7 @@ def test_the_network_runs_in_one_thread_that_ends_with_the_run() -> None:
     assert threading.active_count() == before
 
 
-def test_what_the_network_refuses_is_told_by_a_later_step() -> None:
+def test_a_later_step_raises_what_the_network_refused() -> None:
     class Broken(ConstantDepth):
         def predict(self, frame: Frame) -> DepthPrediction:
             if self.calls == 1:
@@ -223,23 +226,21 @@ def test_what_the_network_refuses_is_told_by_a_later_step() -> None:
         Run(frames(range(40), colour_only), Broken())
 
 
-def test_a_pose_follows_the_keyframe_and_stays_a_rotation() -> None:
-    """Carried a hundred times, each time from the pose before, rounding must not double."""
+def test_the_last_pose_follows_its_keyframe_and_stays_a_rotation() -> None:
+    """Over a hundred corrections, each from the pose before, rounding errors must not double."""
     rng = np.random.default_rng(0)
-    keyframe = MapKeyframe(
-        0, frames([0])[0], None, np.eye(4), np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
-    )
+    map_, motion = Map(), MotionModel()
+    keyframe = map_.add_keyframe(frames([0])[0], None, np.eye(4), np.zeros(0, np.int64))
+    relative, doubled = np.eye(4), np.eye(4)
+    relative[:3, 3], doubled[:3, 3] = [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]
     T = np.eye(4)
     for _ in range(100):
-        keyframe.T_camera_world = T.copy()
-        moved = Moved(keyframe, keyframe.T_world_camera, scale=2.0)
+        map_.correct([0], T[None])
+        motion.anchor(Placement(relative @ T, np.zeros(0, np.int64)), keyframe)
         change = np.eye(4)
         change[:3, :3], change[:3, 3] = so3_exp(rng.normal(size=3)), rng.normal(size=3)
-        keyframe.T_camera_world = change @ keyframe.T_camera_world
-        relative = np.eye(4)
-        relative[:3, 3] = [1.0, 0.0, 0.0]
-        expected = relative.copy()
-        expected[:3, 3] *= 2.0
-        T = moved.carry(relative @ T)
-        np.testing.assert_allclose(T, expected @ keyframe.T_camera_world, atol=1e-9)
+        map_.correct_similarities(invert(change @ keyframe.T_camera_world)[None], np.array([2.0]))
+        motion.follow_map()
+        T = motion.T_camera_world
+        np.testing.assert_allclose(T, doubled @ keyframe.T_camera_world, atol=1e-9)
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-14)

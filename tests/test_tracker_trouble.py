@@ -18,6 +18,7 @@ from tracking_scene import (
     covered,
     frames,
     grey,
+    poses_of,
     position_errors_m,
 )
 
@@ -61,14 +62,14 @@ def test_it_starts_with_the_first_usable_frame(spoil: Change) -> None:
     assert ate_m(made.trajectory) < 0.012
 
 
-def test_a_prior_too_unsure_to_make_points_is_not_called_tracking() -> None:
+def test_a_prior_too_uncertain_to_create_landmarks_is_not_called_tracking() -> None:
     run = Run(frames(range(6), colour_only), ConstantDepth(sigma_log=2.0))
     assert run.statuses() == {INITIALISING: 6}
 
 
 @pytest.mark.parametrize("predicted", [False, True])
 def test_a_hand_over_the_lens(predicted: bool) -> None:
-    """Lost while nothing is seen, found again in the same world, the old map still there."""
+    """Lost while nothing is seen, then relocalised in the same map."""
     change = between(30, 44, covered)
     given = frames(change=(lambda f: colour_only(change(f))) if predicted else change)
     run = Run(given, ConstantDepth() if predicted else None)
@@ -91,7 +92,7 @@ def test_a_hand_over_the_lens(predicted: bool) -> None:
         assert position_errors_m(made.trajectory)[-10:].max() < 0.05
 
 
-def test_dark_frames_are_placed_by_their_depth() -> None:
+def test_dark_frames_are_registered_by_their_depth() -> None:
     run = Run(frames(range(50), between(30, 34, dark)))
     for index in range(30, 35):
         assert run.status_of(index) in {TRACKING, TrackingStatus.REGISTERED}
@@ -107,7 +108,7 @@ def test_dark_frames_are_placed_by_their_depth() -> None:
 
 
 def test_frames_without_a_feature_before_a_rolling_shutter() -> None:
-    """Nothing tells how far away a pixel is where the frame before was placed by its depth alone."""
+    """The distance of a pixel is unknown where the frame before was placed by registration alone."""
     config = Config.from_dict({"shutter": {"readout_ms": 20}})
     run = Run(frames(range(40), between(30, 33, grey)), config=config)
     assert run.status_of(31) is TrackingStatus.REGISTERED
@@ -115,7 +116,7 @@ def test_frames_without_a_feature_before_a_rolling_shutter() -> None:
 
 
 def test_after_dark_frames_the_map_grows_again() -> None:
-    """A keyframe that saw nothing is no measure of what is still seen."""
+    """A keyframe that saw nothing is no reference for the overlap."""
     usual = Run(frames(range(50))).results
     after = Run(frames(range(50), between(30, 34, dark))).results
     assert np.median([r.inliers for r in after[37:]]) > 0.7 * np.median([r.inliers for r in usual[37:]])
@@ -131,7 +132,7 @@ def test_standing_before_a_white_wall_is_no_reason_for_keyframes() -> None:
     run = Run(given)
     assert [r.status for r in run.results[21:]] == [TrackingStatus.REGISTERED] * 12
     assert run.results[-1].keyframes <= run.results[20].keyframes + 2
-    poses = np.stack([r.T_world_camera for r in run.results[20:]])
+    poses = poses_of(run.results[20:])
     assert np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max() < 0.02
 
 
@@ -145,6 +146,7 @@ def test_depth_in_some_frames_only() -> None:
 def test_holes_and_nonsense_in_the_depth() -> None:
     def holes(frame: Frame) -> Frame:
         rng = np.random.default_rng(frame.index)
+        assert frame.depth_m is not None
         depth = frame.depth_m.copy()
         depth[rng.random(depth.shape) < 0.3] = np.nan
         depth[rng.random(depth.shape) < 0.1] = 0.0
@@ -176,7 +178,7 @@ def test_a_network_with_holes() -> None:
     assert all(np.isfinite(k.load_depth_m()).all() for k in made.keyframes)
 
 
-def test_a_network_that_does_not_say_how_sure_it_is() -> None:
+def test_a_network_without_uncertainty() -> None:
     class Silent(ConstantDepth):
         def predict(self, frame: Frame) -> DepthPrediction:
             return replace(super().predict(frame), sigma_log=None)
@@ -188,22 +190,22 @@ def test_a_network_that_does_not_say_how_sure_it_is() -> None:
 
 
 def test_a_jump_is_not_tracked_as_motion() -> None:
-    """Frames missing: the view jumps, and is found again by looking, not by extrapolating."""
+    """Frames are missing: the view jumps, and is placed by what it shows, not by extrapolation."""
     run = Run(frames([*range(20), *range(40, COUNT)]))
     assert all(r.T_world_camera is not None for r in run.results)
     assert ate_m(run.finish().trajectory) < 0.015
 
 
 class SometimesSenseless(ConstantDepth):
-    """Every fourth prediction is hills and holes that are not there; it is as sure of them as of the rest."""
+    """Every fourth prediction has hills and holes that are not there, with the usual deviation."""
 
     def predict(self, frame: Frame) -> DepthPrediction:
-        plain = super().predict(frame)
+        prediction = super().predict(frame)
         if self.calls % 4:
-            return plain
+            return prediction
         noise = np.random.default_rng(self.calls).normal(size=(9, 12)).astype(np.float32)
-        hills = cv2.resize(noise, plain.values.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        return replace(plain, values=plain.values * np.exp(1.6 * hills))
+        hills = cv2.resize(noise, prediction.values.shape[::-1], interpolation=cv2.INTER_CUBIC)
+        return replace(prediction, values=prediction.values * np.exp(1.6 * hills))
 
 
 def test_whole_predictions_that_disagree_with_the_map_are_dropped() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A short rendered walk, models of depth made up for it, and how well a tracker did."""
+"""A short rendered walk, depth models made up for it, and the errors of a tracker."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from slamdepth.depth.sensor import SensorDepth
 from slamdepth.geometry import invert, umeyama
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.synth.sequence import SynthSettings, render_frames, synth_camera
-from slamdepth.tracking import create_tracker
+from slamdepth.tracking import Tracker, create_tracker
 from slamdepth.types import (
     DepthKind,
     DepthPrediction,
@@ -83,7 +83,7 @@ def covered(frame: Frame) -> Frame:
 
 
 class ConstantDepth:
-    """The worst honest network: it says two metres everywhere, and how little it believes that."""
+    """The worst honest network: two metres everywhere, with a large deviation."""
 
     name = "constant"
     kind = DepthKind.METRIC
@@ -102,7 +102,7 @@ class ConstantDepth:
 
 
 def register_constant_depth(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Makes :class:`ConstantDepth` known as the depth model ``constant``."""
+    """Register :class:`ConstantDepth` as the depth model ``constant``."""
 
     def flat(**_: Any) -> ConstantDepth:
         return ConstantDepth()
@@ -119,6 +119,12 @@ class Run:
         self.tracker = create_tracker(CAMERA, model or SensorDepth(), config)
         self.results: list[StepResult] = [self.tracker.step(frame) for frame in given]
 
+    @property
+    def slam(self) -> Tracker:
+        """The tracker by features, for tests that look into its parts."""
+        assert isinstance(self.tracker, Tracker)
+        return self.tracker
+
     def finish(self) -> Reconstruction:
         return self.tracker.finish()
 
@@ -129,18 +135,32 @@ class Run:
         return next(r.status for r in self.results if r.index == index)
 
 
+def poses_of(results: Iterable[StepResult]) -> NDArray[np.float64]:
+    """Poses ``(N, 4, 4)`` of frames that were all placed."""
+    poses = [r.T_world_camera for r in results]
+    placed = [T for T in poses if T is not None]
+    assert len(placed) == len(poses)
+    return np.stack(placed)
+
+
 def errors_m(results: Iterable[StepResult]) -> NDArray[np.float64]:
     """``(N,)`` distances of the placed frames from the truth, the first placed camera aligned."""
     placed = [(r.index, r.T_world_camera) for r in results if r.T_world_camera is not None]
     truth = walk()[1][[index for index, _ in placed]]
     moved = placed[0][1] @ invert(truth[0]) @ truth
-    return np.linalg.norm(moved[:, :3, 3] - np.stack([T for _, T in placed])[:, :3, 3], axis=1)
+    return _distances_m(moved, np.stack([T for _, T in placed]))
+
+
+def _distances_m(T_a: NDArray[np.float64], T_b: NDArray[np.float64]) -> NDArray[np.float64]:
+    distances: NDArray[np.float64] = np.linalg.norm(T_a[:, :3, 3] - T_b[:, :3, 3], axis=1)
+    return distances
 
 
 def truth_of(trajectory: Trajectory) -> NDArray[np.float64]:
     """True poses ``(N, 4, 4)`` at the times of a trajectory, in the first camera of the walk."""
     index = np.rint(trajectory.timestamps_s * SETTINGS.fps).astype(int)
-    return walk()[1][index]
+    poses: NDArray[np.float64] = walk()[1][index]
+    return poses
 
 
 def ate_m(trajectory: Trajectory, *, with_scale: bool = False) -> float:
@@ -153,5 +173,4 @@ def ate_m(trajectory: Trajectory, *, with_scale: bool = False) -> float:
 def position_errors_m(trajectory: Trajectory) -> NDArray[np.float64]:
     """``(N,)`` distances from the truth, with nothing aligned but the first camera."""
     truth = truth_of(trajectory)
-    truth = invert(truth[0]) @ truth
-    return np.linalg.norm(trajectory.T_world_camera[:, :3, 3] - truth[:, :3, 3], axis=1)
+    return _distances_m(trajectory.T_world_camera, invert(truth[0]) @ truth)

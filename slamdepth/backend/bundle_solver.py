@@ -10,17 +10,13 @@ NumPy is slow at many tiny matrices and fast at a few long rows.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth.backend.bundle_problem import BundleProblem
 from slamdepth.backend.point_blocks import inverse_factor, times, times_transposed, transposed_times
 from slamdepth.geometry import reprojection_errors, se3_exp
 from slamdepth.typing import Bools, Floats
-
-if TYPE_CHECKING:
-    from slamdepth.backend.bundle import BundleProblem
-
 
 HUBER = 1.5
 CAUCHY = 2.0

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A second start for an adjustment: cameras that see little are placed anew from those that see much.
+"""Multi-start for bundle adjustment: cameras that see little are re-registered from those that see much.
 
-An adjustment ends in the minimum nearest to where it starts. Before a bare wall a camera is placed by a
+An adjustment ends in the minimum nearest to where it starts. A camera before a bare wall is placed by a
 few points whose depth a network has guessed; it may be turned by ten degrees to fit them, and no number
-of steps turns it back. So the cameras that share many points, which geometry alone holds, are kept, and the
-others are added one by one as incremental structure from motion adds them (Schönberger and Frahm,
-"Structure-from-Motion Revisited", CVPR 2016): resection from the points that placed cameras triangulate, no
-predicted depth, a small adjustment, next. What is better is then for the whole adjustment to say.
+of steps turns it back. So the cameras that share many points, which geometry alone determines, are kept, and
+the others are added one by one as incremental structure from motion adds them (Schönberger and Frahm,
+"Structure-from-Motion Revisited", CVPR 2016): resection from the points that registered cameras triangulate,
+without predicted depth, a small adjustment, the next camera. The whole adjustment then decides which start
+is better.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from slamdepth.backend.bundle import BundleProblem, bundle_adjust
+from slamdepth.backend.bundle import bundle_adjust
+from slamdepth.backend.bundle_problem import BundleProblem
 from slamdepth.geometry import backproject, invert, orthonormalised, rotation_angle_rad, transform
 from slamdepth.typing import Bools, Ints
 
@@ -32,11 +34,16 @@ _TURNED_RAD = np.deg2rad(3.0)  # less is the same start
 _MOVED = 0.06  # of the distance to what is seen
 
 
-def placed_anew(problem: BundleProblem) -> BundleProblem | None:
-    """``problem`` with another start; None where there is none worth a try.
+def multi_start(problem: BundleProblem) -> BundleProblem | None:
+    """Another start for an adjustment.
 
-    The first fixed camera, which must be there, stays where it is, the others move along.
-    Nothing is random: the same problem gives the same start.
+    The first fixed camera stays where it is. Nothing is random: the same problem gives the same start.
+
+    Args:
+        problem: at least one camera is fixed.
+
+    Returns:
+        ``problem`` with other poses and points; None where no other start is worth a try.
     """
     growth = _Growth(problem)
     if not growth.is_possible:

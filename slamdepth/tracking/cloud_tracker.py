@@ -6,20 +6,22 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from dataclasses import dataclass
+from types import TracebackType
 
 import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.depth.alignment import as_given
-from slamdepth.depth.base import DepthModel
+from slamdepth.depth.base import DepthModel, is_sensor
+from slamdepth.depth.metric import metric_model
 from slamdepth.errors import TrackingError
 from slamdepth.frontend.registration import CloudOdometry, CloudOdometryConfig, depth_to_cloud
 from slamdepth.geometry import invert, project, transform
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.keyframe_store import KeyframeStore, StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.tracking.checks import check_frame, model_for
-from slamdepth.tracking.threads import single_threaded
+from slamdepth.thread_limits import single_threaded
+from slamdepth.tracking.frame_log import check_frame
 from slamdepth.types import (
     Camera,
     Frame,
@@ -59,7 +61,7 @@ class CloudTracker:
     ) -> None:
         self.camera = camera
         self.config = config or Config()
-        self._depth_model = model_for(depth_model, self.config)
+        self._depth_model = metric_model(depth_model, self.config)
         reach = CloudOdometryConfig(
             min_m=max(self.config.depth.min_m, 0.2), max_m=min(self.config.depth.max_m, 5.0)
         )
@@ -83,7 +85,7 @@ class CloudTracker:
         self._last_time_s = frame.timestamp_s
         self._frames += 1
         timings: dict[str, float] = {}
-        if self._depth_model.name == "sensor" and frame.depth_m is None:
+        if is_sensor(self._depth_model) and frame.depth_m is None:
             return self._result(frame, None, 0, False, timings)
         start = time.perf_counter()
         prediction = self._depth_model.predict(frame)
@@ -143,6 +145,18 @@ class CloudTracker:
             keyframes=len(self._keyframes),
             timings_ms=timings_ms,
         )
+
+    def close(self) -> None:
+        """End the odometry; there are no threads to be ended."""
+        self._finished = True
+
+    def __enter__(self) -> CloudTracker:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     def finish(self) -> Reconstruction:
         """Hand over the trajectory; errors as for ``Tracker.finish``."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many cores a thread may use."""
+"""Limits on the threads that native libraries start."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def _controller() -> Any:
 def _take_control() -> None:
     """Make the calling thread the one that threadpoolctl lets set OpenBLAS' number of threads.
 
-    From 3.8 on the first thread that sets it is the only one that may, and others do nothing without a
-    word; here the first to enter and the last to leave may be two threads.
+    Since version 3.8 the first thread that sets it is the only one that may, and calls of others are
+    ignored silently; here the first to enter and the last to leave may be two threads.
     """
     for library in _controller().lib_controllers:
         if hasattr(library, "clear_controlling_thread"):
@@ -40,9 +40,9 @@ def _take_control() -> None:
 def single_threaded() -> Iterator[None]:
     """Limit OpenCV, and NumPy's and SciPy's BLAS, to one thread while any thread is inside.
 
-    For small matrices and images two spend more time waiting than working, all the more where the other
-    core is predicting depth; and sums then do not depend on the number of cores. The number is the
-    whole process's, so the last to leave sets it back.
+    On small matrices and images two threads wait more than they work, the more so while the other core
+    predicts depth, and sums would depend on the number of cores. The limit applies to the whole
+    process, so the last to leave restores it.
     """
     import cv2
 
@@ -66,10 +66,9 @@ def single_threaded() -> Iterator[None]:
 
 
 def one_thread_here() -> None:
-    """From now on parallel loops of native code started by the calling thread stay in it.
+    """Let parallel loops of native code that the calling thread starts run in that thread alone.
 
-    OpenMP, which torch computes with, keeps the number for each thread that starts a loop,
-    so that other threads are not concerned.
+    OpenMP, which torch uses, keeps the limit per thread that starts a loop; other threads are not affected.
     """
     from threadpoolctl import ThreadpoolController
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long the stages of each frame take."""
+"""Wall time of the stages of a run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Milliseconds by the name of the stage, for the frame at hand and on average."""
+    """Milliseconds per stage, of the current frame and on average."""
 
     def __init__(self) -> None:
         self.frame_ms: dict[str, float] = {}
@@ -18,12 +18,12 @@ class Stopwatch:
         self._times: dict[str, int] = defaultdict(int)
 
     def next_frame(self) -> None:
-        """Begin with another frame; what was handed out stays as it is."""
+        """Start the next frame; dictionaries handed out before do not change."""
         self.frame_ms = {}
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Measure what happens inside."""
+        """Measure the body of a ``with`` statement."""
         start = time.perf_counter()
         try:
             yield
@@ -31,15 +31,15 @@ class Stopwatch:
             self.add(stage, (time.perf_counter() - start) * 1e3)
 
     def add(self, stage: str, ms: float) -> None:
-        """Count time that was measured elsewhere."""
+        """Add time that was measured elsewhere."""
         self.frame_ms[stage] = self.frame_ms.get(stage, 0.0) + ms
         self._total_ms[stage] += ms
         self._times[stage] += 1
 
     def mean_ms(self) -> dict[str, float]:
-        """Mean over all times a stage was measured."""
+        """Mean over all calls of each stage."""
         return {stage: total / self._times[stage] for stage, total in self._total_ms.items()}
 
     def calls(self) -> dict[str, int]:
-        """How often each stage was measured."""
+        """Number of calls of each stage."""
         return dict(self._times)

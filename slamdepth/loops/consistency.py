@@ -16,10 +16,8 @@ import numpy as np
 
 from slamdepth.backend.pose_graph import Edge
 from slamdepth.geometry import invert, rotation_angle_rad
+from slamdepth.loops.edges import STEP_SIGMAS
 from slamdepth.typing import Floats
-
-STEP_SIGMAS = (0.01, 0.02, 0.02)
-"""What a keyframe's step may err by: radians, metres, natural logarithm of the scale."""
 
 _AGREEING = 3  # keyframes that must see the same place
 _REMEMBERED = 12  # keyframes a refused loop is kept for: farther apart, drift hides agreement
@@ -40,8 +38,8 @@ class RefusedLoops:
         self._edges = {j: e for j, e in self._edges.items() if j > edge.j - _REMEMBERED}
         self._edges.setdefault(edge.j, edge)
 
-    def forget(self) -> None:
-        """Drop all: the map was bent, and what they said has been heard."""
+    def clear(self) -> None:
+        """Drop all, after the map was corrected."""
         self._edges.clear()
 
     def insisted(self, T_world_camera: Floats, *, with_scale: bool) -> list[Edge]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be found out about a frame before its turn comes."""
+"""Features of a frame, which any thread may find before the frame's turn comes."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import numpy as np
 
 from slamdepth.config import FeatureConfig
 from slamdepth.frontend.features import Features, create_extractor
-from slamdepth.tracking.threads import single_threaded
+from slamdepth.thread_limits import single_threaded
 from slamdepth.types import Camera, Frame
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A frame's features, and how long they took to find, in milliseconds."""
+    """A frame's features, and how many milliseconds they took."""
 
     features: Features
     took_ms: float
 
 
 class Preparation:
-    """Finds features; any thread may call it.
+    """Finds features; any thread may call it, one at a time is served.
 
     Attributes:
         levels: sizes the features come in.
@@ -47,10 +47,3 @@ class Preparation:
             gray = np.asarray(cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
             features = self._extractor.extract(gray, self._camera)
             return Prepared(features, (time.perf_counter() - start) * 1e3)
-
-
-def load_libraries() -> None:
-    """Import what the first keyframes would import: a second's pause in the middle of tracking."""
-    import gtsam  # noqa: F401
-    import scipy.linalg
-    import scipy.sparse  # noqa: F401

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The direction of gravity in the world, agreed on by the images of several keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slamdepth.typing import Floats
+
+_MIN_ESTIMATES = 6
+_MIN_SHARE = 0.7  # of all confidence that must agree
+_AGREEMENT = np.cos(np.radians(15.0))
+_CHECK_EVERY = 5  # images: the direction is estimated again even where it is known
+
+
+class GravityConsensus:
+    """Collects estimates of gravity from single images; what most of them agree on is known.
+
+    One image may mistake a wall for the floor. The camera's rotation from keyframe to keyframe is known to
+    a degree, so several images share one direction, and it need not be estimated in the next.
+    """
+
+    def __init__(self) -> None:
+        self._estimates_w: list[Floats] = []
+        self._confidences: list[float] = []
+        self._queries = 0
+
+    def in_camera(self, R_world_camera: Floats) -> Floats | None:
+        """Unit direction of gravity ``(3,)`` in a camera's frame.
+
+        Args:
+            R_world_camera: ``(3, 3)``.
+
+        Returns:
+            None where the image should be asked: before enough agree, and every fifth time.
+        """
+        self._queries += 1
+        gravity_w = self.in_world()
+        if gravity_w is None or self._queries % _CHECK_EVERY == 0:
+            return None
+        return R_world_camera.T @ gravity_w
+
+    def add(self, R_world_camera: Floats, gravity: Floats, confidence: float) -> None:
+        """Add the estimate of one image.
+
+        Args:
+            R_world_camera: ``(3, 3)``.
+            gravity: ``(3,)`` unit direction in the camera's frame.
+            confidence: 0 to 1.
+        """
+        self._estimates_w.append(R_world_camera @ gravity)
+        self._confidences.append(confidence)
+
+    def in_world(self) -> Floats | None:
+        """The unit direction ``(3,)`` in the world that most agree on; None before enough do."""
+        if len(self._estimates_w) < _MIN_ESTIMATES:
+            return None
+        estimates, confidences = np.stack(self._estimates_w), np.array(self._confidences)
+        alike = estimates @ estimates.T > _AGREEMENT
+        votes = alike @ confidences
+        best = int(votes.argmax())
+        if votes[best] < _MIN_SHARE * confidences.sum():
+            return None
+        mean = confidences[alike[best]] @ estimates[alike[best]]
+        return np.asarray(mean / np.linalg.norm(mean))

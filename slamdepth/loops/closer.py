@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Closing loops: a place seen before, verified by geometry, joined in one map."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slamdepth.backend.pose_graph import Edge, PoseGraphResult, optimise_pose_graph
+from slamdepth.config import Config
+from slamdepth.geometry import invert, rotation_angle_rad, transform
+from slamdepth.loops.consistency import RefusedLoops
+from slamdepth.loops.edges import MeasuredLoop, odometry_edges
+from slamdepth.loops.places import PlaceRecogniser
+from slamdepth.mapping.map import Map, MapKeyframe
+from slamdepth.mapping.map_view import NEAREST_M
+from slamdepth.mapping.placement import Placement
+from slamdepth.typing import Floats
+
+log = logging.getLogger(__name__)
+
+_ALREADY_LINKED = 15  # shared landmarks that make two keyframes neighbours
+_CANDIDATES = 2
+_MIN_SCORE_SHARE = 0.6  # of the similarity of two neighbours in time
+_MIN_VERIFIED = 15  # matches that verification starts from
+_LOOP_SIGMAS = (0.01, 0.02, 0.03)  # radians, metres, natural logarithm of the scale
+_LOOSER = (2.0, 4.0, 8.0)  # factors on the odometry's deviations, once confirmed loops contradict it
+
+
+class Verifier(Protocol):
+    """Places a camera by matching its features with one keyframe."""
+
+    def from_keyframe(
+        self, features: Any, keyframe_id: int, *, minimum: int | None = None
+    ) -> Placement | None: ...
+
+
+@dataclass(frozen=True)
+class LoopClosure:
+    """A loop that was closed.
+
+    Attributes:
+        candidate: the earlier keyframe whose place was seen.
+        scales: ``(K,)`` factor on each keyframe's metres.
+    """
+
+    candidate: int
+    scales: Floats
+
+
+class LoopCloser:
+    """Finds loops of new keyframes and corrects the map so that they close.
+
+    Attributes:
+        places: index of keyframes by what they look like.
+        count: loops closed; a revisit that links many keyframes in a row is one.
+    """
+
+    def __init__(self, config: Config, map_: Map, verifier: Verifier) -> None:
+        self._config = config
+        self._map = map_
+        self._verifier = verifier
+        self.places = PlaceRecogniser()
+        self._loops: list[MeasuredLoop] = []
+        self._refused = RefusedLoops()
+        self._last: tuple[int, int] | None = None
+        self.count = 0
+
+    def describe(self, features: Any) -> NDArray[np.float32]:
+        """The place vector of an image's features; any thread may ask."""
+        return self.places.describe(features.place_descriptors)
+
+    def close(self, keyframe: MapKeyframe, words: NDArray[np.float32]) -> LoopClosure | None:
+        """Index a keyframe and look for a loop at it; where one closes, the map has been corrected.
+
+        Args:
+            words: place vector of its features, see :meth:`describe`.
+        """
+        self.places.add_vector(keyframe.id, words)
+        if not self._config.loops.enabled:
+            return None
+        for candidate in self.candidates(keyframe):
+            verified = self.verify(keyframe, candidate)
+            if verified is None:
+                continue
+            scales = self._apply(keyframe, candidate, *verified)
+            if scales is not None:
+                if self._is_new(keyframe.id, candidate):
+                    self.count += 1
+                self._last = (keyframe.id, candidate)
+                log.info("loop closed: keyframe %d sees the place of keyframe %d", keyframe.id, candidate)
+                return LoopClosure(candidate, scales)
+        return None
+
+    def _is_new(self, keyframe: int, candidate: int) -> bool:
+        if self._last is None:
+            return True
+        gap = self._config.loops.min_gap
+        return keyframe - self._last[0] > gap or abs(candidate - self._last[1]) > gap
+
+    def candidates(self, keyframe: MapKeyframe) -> list[int]:
+        """Earlier keyframes that look like ``keyframe`` and share no landmarks with it, best first."""
+        newest = keyframe.id - self._config.loops.min_gap
+        if newest < 0:
+            return []
+        shared = self._map.shared_landmarks(keyframe.landmark_ids)
+        exclude = {k for k in range(len(shared)) if k > newest or shared[k] >= _ALREADY_LINKED}
+        least = _MIN_SCORE_SHARE * self.places.score(keyframe.id, keyframe.id - 1)
+        answers = self.places.query_keyframe(keyframe.id, exclude=exclude, top_k=_CANDIDATES)
+        return [k for k, score in answers if score >= least]
+
+    def verify(self, keyframe: MapKeyframe, candidate: int) -> tuple[Placement, float] | None:
+        """Where ``candidate`` places ``keyframe``, and the ratio of their metres.
+
+        Returns:
+            None where too few landmarks of the candidate's place are seen.
+        """
+        placement = self._verifier.from_keyframe(keyframe.features, candidate, minimum=_MIN_VERIFIED)
+        if placement is None:
+            return None
+        self._map.count_views(placement.expected_ids, placement.found_ids)
+        if placement.inliers < self._config.loops.min_inliers:
+            return None
+        both = np.flatnonzero((placement.landmark_ids >= 0) & (keyframe.landmark_ids >= 0))
+        both = both[placement.landmark_ids[both] != keyframe.landmark_ids[both]]
+        scale = 1.0
+        if not self._map.is_measured and len(both) >= 10:
+            position_w = self._map.landmarks.position_w
+            there = transform(placement.T_camera_world, position_w[placement.landmark_ids[both]])[:, 2]
+            here = transform(keyframe.T_camera_world, position_w[keyframe.landmark_ids[both]])[:, 2]
+            ok = (there > NEAREST_M) & (here > NEAREST_M)
+            if np.count_nonzero(ok) >= 10:
+                scale = float(np.exp(np.median(np.log(there[ok] / here[ok]))))
+        return placement, scale
+
+    def _apply(
+        self, keyframe: MapKeyframe, candidate: int, placement: Placement, scale: float
+    ) -> Floats | None:
+        """Correct the map by a verified loop; returns the scales ``(K,)``, None where the loop is refused."""
+        T_loop = self._map.keyframes[candidate].T_camera_world @ invert(placement.T_camera_world)
+        edge = Edge(candidate, keyframe.id, T_loop, scale, _LOOP_SIGMAS, is_loop=True)
+        new = [edge]
+        scales = np.ones(len(self._map.keyframes))
+        units = self._map.units
+        if _is_off(keyframe, placement, scale):
+            T_old = self._map.T_world_camera
+            result = self._optimised(T_old, new)
+            if result is None:
+                new = self._refused.confirmed(edge, T_old, with_scale=not self._map.is_measured)
+                result = self._optimised_after_drift(T_old, new)
+            if result is None:
+                self._refused.add(edge)
+                new = self._refused.insisted(T_old, with_scale=not self._map.is_measured)
+                result = self._optimised_after_break(T_old, new)
+            if result is None:
+                log.info("loop %d-%d refused by the pose graph", candidate, keyframe.id)
+                return None
+            scales = result.scales
+            self._map.correct_similarities(result.T_world_camera, scales)
+            self._refused.clear()
+        self._loops += [MeasuredLoop.of(loop, units) for loop in new]
+        self._map.fuse_view(keyframe, placement.landmark_ids)
+        return scales
+
+    def _edges(self, looser: float = 1.0, *, after: int = -1) -> list[Edge]:
+        units = self._map.units
+        odometry = odometry_edges(self._map, looser, after=after)
+        return [*odometry, *(loop.in_units(units) for loop in self._loops)]
+
+    def _optimised(self, T_old: Floats, new: list[Edge], looser: float = 1.0) -> PoseGraphResult | None:
+        """The pose graph with the loops ``new``; None where one of them is an outlier."""
+        edges = [*self._edges(looser), *new]
+        result = optimise_pose_graph(T_old, edges, with_scale=not self._map.is_measured)
+        return result if result.is_inlier[-len(new) :].all() else None
+
+    def _optimised_after_drift(self, T_old: Floats, confirmed: list[Edge]) -> PoseGraphResult | None:
+        """The pose graph with odometry believed less, where several loops agree that odometry drifted."""
+        if not confirmed:
+            return None
+        for looser in _LOOSER:
+            result = self._optimised(T_old, confirmed, looser)
+            if result is not None:
+                log.info("%d loops agree on a large drift", len(confirmed))
+                return result
+        return None
+
+    def _optimised_after_break(self, T_old: Floats, insisted: list[Edge]) -> PoseGraphResult | None:
+        """The pose graph where one keyframe after the other sees another place than odometry led to.
+
+        Odometry is believed up to where two keyframes share fewest landmarks, and hardly from there on.
+        """
+        if not insisted:
+            return None
+        together = self._map.covisibility()
+        before, after = max(edge.i for edge in insisted), min(edge.j for edge in insisted)
+        if before >= after:
+            return None
+        links = together[np.arange(before, after), np.arange(before + 1, after + 1)]
+        last_good = before + int(np.argmin(links))
+        edges = self._edges(_LOOSER[-1], after=last_good)
+        edges += [replace(edge, is_loop=False) for edge in insisted]
+        log.info("%d loops insist: odometry is not believed after keyframe %d", len(insisted), last_good)
+        return optimise_pose_graph(T_old, edges, with_scale=not self._map.is_measured)
+
+
+def _is_off(keyframe: MapKeyframe, placement: Placement, scale: float) -> bool:
+    """Whether a loop differs enough from the present pose to correct the map."""
+    D = placement.T_camera_world @ keyframe.T_world_camera
+    far = float(np.linalg.norm(D[:3, 3])) > 0.02
+    return far or float(rotation_angle_rad(D[:3, :3])) > np.deg2rad(1.0) or abs(np.log(scale)) > 0.03

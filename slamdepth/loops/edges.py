@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Edges of the pose graph: odometry from what keyframes share, and loops as they were measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamdepth.backend.pose_graph import Edge
+from slamdepth.mapping.map_view import MapView
+from slamdepth.typing import Floats
+
+STEP_SIGMAS = (0.01, 0.02, 0.02)
+"""Deviation of the step from one keyframe to the next: radians, metres, natural logarithm of the scale."""
+
+_COVISIBLE = 80  # shared landmarks that make an edge
+_MAX_PARTNERS = 10  # earlier keyframes that one is tied to, not counting the one just before it
+
+
+def odometry_edges(map_: MapView, looser: float = 1.0, *, after: int = -1) -> list[Edge]:
+    """Edges between neighbours in time and between keyframes that share most landmarks.
+
+    A keyframe's edges all come from the same observations, so each counts for its share only.
+
+    Args:
+        looser: factor on the deviations of edges to keyframes after ``after``, by default of all.
+    """
+    keyframes = map_.keyframes
+    together = map_.covisibility()
+    edges = []
+    for j, keyframe in enumerate(keyframes[1:], start=1):
+        shared = together[j, :j]
+        best = np.argsort(-shared, kind="stable")[:_MAX_PARTNERS]
+        partners = {j - 1, *best[shared[best] >= _COVISIBLE].tolist()}
+        factor = np.sqrt(len(partners)) * (looser if j > after else 1.0)
+        rotation, translation, log_scale = (sigma * factor for sigma in STEP_SIGMAS)
+        for i in sorted(partners):
+            T_i_j = keyframes[i].T_camera_world @ keyframe.T_world_camera
+            edges.append(Edge(i, j, T_i_j, 1.0, (rotation, translation, log_scale)))
+    return edges
+
+
+@dataclass(frozen=True)
+class MeasuredLoop:
+    """A loop edge, and the units of its keyframes when it was measured.
+
+    A correction of the map multiplies the metres of keyframes; the measurement stays what it was.
+    """
+
+    edge: Edge
+    unit_i: float
+    unit_j: float
+
+    @staticmethod
+    def of(edge: Edge, units: Floats) -> MeasuredLoop:
+        """A loop measured in a map whose keyframes have ``units (K,)``, see :class:`MapKeyframe`."""
+        return MeasuredLoop(edge, float(units[edge.i]), float(units[edge.j]))
+
+    def in_units(self, units: Floats) -> Edge:
+        """The edge in the metres that keyframes have now."""
+        edge = self.edge
+        scale_i, scale_j = units[edge.i] / self.unit_i, units[edge.j] / self.unit_j
+        T_i_j = edge.T_i_j.copy()
+        T_i_j[:3, 3] *= scale_i
+        return replace(edge, T_i_j=T_i_j, scale_i_j=edge.scale_i_j * scale_i / scale_j)

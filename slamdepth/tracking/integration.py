@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a keyframe joins the map: at once, and stage by stage when its depth is there.
+
+A network takes several frames' time for one depth map. So a keyframe joins the map at once with the
+landmarks it sees, its depth is predicted in another thread, and a fixed number of frames later, or
+earlier where tracking needs it, landmarks are created and the window is adjusted. Meanwhile another
+frame may become a keyframe. What happens when depends on the frames alone and not on how fast the
+threads were, so the trajectory is the same on every run.
+
+Each stage runs between two frames, so that none of them delays a frame for long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slamdepth.backend.bundle import BundleResult
+from slamdepth.config import Config
+from slamdepth.frontend.features import Features
+from slamdepth.loops.closer import LoopCloser
+from slamdepth.mapping.map import Map, MapKeyframe
+from slamdepth.mapping.placement import Placement
+from slamdepth.stopwatch import Stopwatch
+from slamdepth.tracking.adjuster import Adjuster
+from slamdepth.tracking.frame_log import FrameLog
+from slamdepth.tracking.keyframe_policy import KeyframePolicy
+from slamdepth.tracking.local_mapper import LocalMapper
+from slamdepth.tracking.localiser import Localiser
+from slamdepth.tracking.rolling_shutter import RollingShutter
+from slamdepth.tracking.workers import Workers
+from slamdepth.types import Camera, Frame
+from slamdepth.typing import Floats
+
+_MAX_WAITING = 2  # keyframes; with three, landmarks are missed that the oldest would have created
+_WAITED_FOR = 4  # first keyframes whose depth is waited for: all that follows builds on their landmarks
+
+
+@dataclass
+class _Waiting:
+    """A keyframe whose integration is not complete."""
+
+    keyframe: MapKeyframe
+    frames_left: int  # until its stages begin
+    stages: Iterator[None]
+    has_landmarks: bool = False
+
+
+class KeyframeIntegration:
+    """Grows the map with keyframes.
+
+    Attributes:
+        mapper, adjuster, loops: the parts of the work, which finishing the map uses again.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config,
+        map_: Map,
+        localiser: Localiser,
+        frames: FrameLog,
+        shutter: RollingShutter,
+        workers: Workers,
+        watch: Stopwatch,
+    ) -> None:
+        self._config = config
+        self._map = map_
+        self._frames = frames
+        self._shutter = shutter
+        self._workers = workers
+        self._timed = watch.timed
+        self.mapper = LocalMapper(camera, config, map_, localiser)
+        self.adjuster = Adjuster(camera, config, map_, shutter, workers.side)
+        self.loops = LoopCloser(config, map_, localiser)
+        self._policy = KeyframePolicy(config, map_)
+        self._waiting: list[_Waiting] = []  # oldest first
+        self._is_adjusting = False
+        self._readout: Future[BundleResult] | None = None
+
+    def wants(self, placement: Placement) -> bool:
+        """Whether a frame should become a keyframe; see :class:`KeyframePolicy`."""
+        return self._policy.wants(placement)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether one more keyframe has to wait until the oldest has created its landmarks."""
+        return sum(not waiting.has_landmarks for waiting in self._waiting) >= _MAX_WAITING
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the next stage of the oldest waiting keyframe may run."""
+        return bool(self._waiting) and self._waiting[0].frames_left <= 0
+
+    @property
+    def is_adjusting(self) -> bool:
+        """Whether an adjustment is in progress, during which landmark ids must not change."""
+        return self._is_adjusting
+
+    def count_frame(self) -> None:
+        """Count a frame; stages begin after ``tracking.depth_delay`` of them."""
+        for waiting in self._waiting:
+            waiting.frames_left -= 1
+
+    def add_keyframe(
+        self, frame: Frame, features: Features, placement: Placement, velocity: Floats
+    ) -> MapKeyframe:
+        """Put a frame into the map and request its depth; the stages of its integration follow.
+
+        Args:
+            features: corrected for the rolling shutter.
+            velocity: ``(6,)`` m/s and rad/s, camera frame.
+        """
+        depth = self._workers.depth
+        depth.request(frame, placement.T_camera_world[:3, :3].T)
+        with self._timed("mapping"):
+            keyframe = self._map.add_keyframe(
+                frame, features, placement.T_camera_world, placement.landmark_ids, velocity
+            )
+        self._policy.keyframe_made()
+        delay = 0 if depth.is_instant(frame) else self._config.tracking.depth_delay
+        words = self._workers.side.submit(self.loops.describe, keyframe.features)
+        waiting = _Waiting(keyframe, delay, iter(()))
+        waiting.stages = self._stages(waiting, words)
+        self._waiting.append(waiting)
+        if len(self._map.keyframes) <= _WAITED_FOR:
+            self.run_all()
+        return keyframe
+
+    def _stages(self, waiting: _Waiting, words: Future[NDArray[np.float32]]) -> Iterator[None]:
+        """What follows a keyframe's depth; a frame is tracked at each ``yield``."""
+        keyframe = waiting.keyframe
+        prediction = self._workers.depth.take(keyframe.frame.load())
+        with self._timed("mapping"):
+            self._update_velocity(keyframe)
+            self.mapper.add_depth(keyframe, prediction)
+            neighbours = self.mapper.neighbours(keyframe)
+            self.mapper.search(keyframe, neighbours[::2])
+        waiting.has_landmarks = True
+        self._policy.landmarks_created()
+        yield
+        yield from self._search_and_adjust(keyframe, neighbours[1::2])
+        yield
+        with self._timed("loops"):
+            closure = self.loops.close(keyframe, words.result())
+        if closure is not None:  # tie the two sides of the loop together by what both see
+            yield
+            yield from self._search_and_adjust(keyframe, self.mapper.neighbours(keyframe))
+            yield
+        with self._timed("mapping"):
+            self._map.cull(keyframe)
+            self._map.spill_images()
+
+    def _search_and_adjust(self, keyframe: MapKeyframe, neighbours: list[int]) -> Iterator[None]:
+        """Search the keyframe's landmarks in ``neighbours`` and adjust the window in the side thread."""
+        with self._timed("mapping"):
+            self.mapper.search(keyframe, neighbours)
+        with self._timed("bundle"):
+            adjustment = self.adjuster.begin_window(keyframe)
+        self._is_adjusting = adjustment is not None
+        yield
+        yield  # two frames' time for the side thread
+        self._take_readout()
+        with self._timed("bundle"):
+            if adjustment is not None:
+                self.adjuster.complete(adjustment)
+                self._is_adjusting = False
+            if self._shutter.is_due(keyframe.id + 1):
+                self._readout = self.adjuster.begin_readout()
+
+    def run_all(self) -> bool:
+        """Complete the integration of all waiting keyframes; False where none waits."""
+        self._take_readout()
+        if not self._waiting:
+            return False
+        while self._waiting:
+            self.run_stage()
+        return True
+
+    def run_until_landmarks(self) -> None:
+        """Run stages until one more waiting keyframe has created its landmarks."""
+        while self._waiting:
+            oldest = self._waiting[0]
+            had_landmarks = oldest.has_landmarks
+            self.run_stage()
+            if oldest.has_landmarks and not had_landmarks:
+                return
+
+    def run_stage(self) -> None:
+        """Run the next stage of the oldest waiting keyframe."""
+        is_complete = next(self._waiting[0].stages, _COMPLETE) is _COMPLETE
+        if is_complete:
+            del self._waiting[0]
+
+    def _update_velocity(self, keyframe: MapKeyframe) -> None:
+        """The frames after a keyframe say how it moved, too."""
+        velocity = self._frames.velocity_at(keyframe.id)
+        if velocity is not None:
+            self._map.set_velocity(keyframe, velocity)
+        if self._shutter.is_active:
+            self._shutter.correct_keyframe(keyframe)
+
+    def _take_readout(self) -> None:
+        """Take over the readout time that the side thread estimated, if it was asked."""
+        if self._readout is None:
+            return
+        with self._timed("bundle"):
+            has_changed = self.adjuster.complete_readout(self._readout)
+            self._readout = None
+            if has_changed:
+                self._shutter.correct_keyframes()
+
+
+_COMPLETE = object()
