@@ -172,7 +172,7 @@ def test_stride_limit_and_no_mesh(tiny_room: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert not (folder / "mesh.ply").exists()
     assert not (folder / "mesh.png").exists()
-    assert "no picture of one" in (folder / "report.html").read_text(encoding="utf-8")
+    assert "no image of one" in (folder / "report.html").read_text(encoding="utf-8")
     times = read_tum_trajectory(folder / "trajectory.txt")[0].timestamps_s
     expected = read_tum_trajectory(tiny_room / "groundtruth.txt")[0].timestamps_s[:12:2]
     assert times.tolist() == expected.tolist()

@@ -109,6 +109,7 @@ def full_data() -> ReportData:
     return ReportData(
         sequence="room <1>",
         depth_model="dinov2",
+        depth_is_measured=False,
         reconstruction=Reconstruction(
             trajectory=estimate,
             keyframes=keyframes,
@@ -143,7 +144,7 @@ def bare_data() -> ReportData:
     nothing = Trajectory(np.empty(0), np.empty((0, 4, 4)))
     run = Reconstruction(nothing, (), np.empty((0, 3)))
     return ReportData(
-        "empty", "sensor", run, 0.0, Config(), ScaleFacts(ScaleSource.SENSOR, 1.0, "The sensor's.")
+        "empty", "sensor", True, run, 0.0, Config(), ScaleFacts(ScaleSource.SENSOR, 1.0, "The sensor's.")
     )
 
 
@@ -364,15 +365,17 @@ def test_depth_runs_from_dark_blue_over_green_to_yellow() -> None:
     assert colours[1][1] > colours[1][2]
 
 
-def test_gallery_spreads_over_the_run_and_shows_the_sensor_beside_a_prediction() -> None:
+def test_the_gallery_spreads_over_the_run_and_shows_the_sensor_next_to_a_prediction() -> None:
     predicted = keyframe_gallery(tuple(keyframe(i) for i in range(7)), count=3)
     assert predicted is not None
-    assert [picture.id for picture in predicted.pictures] == [0, 3, 6]
-    assert all(picture.sensor for picture in predicted.pictures)
+    assert [keyframe.id for keyframe in predicted.keyframes] == [0, 3, 6]
+    assert all([*shown.images] == ["image", "depth", "sensor depth"] for shown in predicted.keyframes)
+    assert predicted.has_sensor
     assert 0.5 <= predicted.near_m < predicted.far_m <= 4.0
     sensor = keyframe_gallery((keyframe(0, is_sensor=True),))
     assert sensor is not None
-    assert [picture.sensor for picture in sensor.pictures] == [None]
+    assert [[*shown.images] for shown in sensor.keyframes] == [["image", "depth"]]
+    assert not sensor.has_sensor
     unknown = replace(keyframe(0), in_metres=lambda prediction: np.zeros_like(prediction.values))
     assert keyframe_gallery((unknown,)) is not None
     assert keyframe_gallery(()) is None

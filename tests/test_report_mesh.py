@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a mesh is looked at from, and its pictures in a report."""
+"""Where a mesh is looked at from, and its images in a report."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from slamdepth.geometry import invert, project, so3_exp, transform
 from slamdepth.io import read_image_rgb
 from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.report import MeshPicture, build_html, build_summary, mesh_pictures, write_mesh_png
-from slamdepth.report.viewpoints import from_above, guessed_down, look_at, over_the_shoulder, picture_camera
+from slamdepth.report import MeshImage, build_html, build_summary, render_mesh_images, write_mesh_png
+from slamdepth.report.viewpoints import from_above, guessed_gravity, ideal_camera, look_at, over_the_shoulder
 from slamdepth.types import Trajectory
 
 DOWN = np.array([0.0, 1.0, 0.0])
-CAMERA = picture_camera(90, 60, 50.0)
+CAMERA = ideal_camera(90, 60, 50.0)
 
 
 def corner_room() -> Mesh:
@@ -54,7 +54,7 @@ def room_run(gravity_w: np.ndarray | None = DOWN) -> Reconstruction:
     return replace(run, trajectory=Trajectory(np.arange(10.0), walk()), gravity_w=gravity_w)
 
 
-def test_from_above_all_is_in_the_picture_and_the_eye_is_above_on_the_side_of_the_fronts() -> None:
+def test_from_above_all_is_in_the_image_and_the_eye_is_above_on_the_side_of_the_fronts() -> None:
     mesh, path = corner_room(), walk()[:, :3, 3]
     for down in (DOWN, so3_exp(np.array([0.3, 0.0, 0.1])) @ DOWN):
         T = from_above(mesh, path, down, CAMERA)
@@ -82,29 +82,29 @@ def test_over_the_shoulder_is_a_step_behind_the_path_and_level() -> None:
     assert over_the_shoulder(corner_room(), away, DOWN, CAMERA) is None
 
 
-def test_down_is_guessed_from_cameras_that_were_held_level() -> None:
+def test_gravity_is_guessed_from_cameras_that_were_held_level() -> None:
     R = so3_exp(np.array([0.7, 0.2, -0.3]))
     T = walk()
     T[:, :3, :3] = R @ T[:, :3, :3]
-    np.testing.assert_allclose(guessed_down(T), R @ DOWN, atol=1e-9)
+    np.testing.assert_allclose(guessed_gravity(T), R @ DOWN, atol=1e-9)
     assert walk()[:, :3, 1].mean(axis=0) @ DOWN < 0.96  # their y axes alone tell less
     still = np.tile(np.eye(4), (5, 1, 1))
-    np.testing.assert_allclose(guessed_down(still), DOWN)
+    np.testing.assert_allclose(guessed_gravity(still), DOWN)
     upside_down = np.stack([np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])])
-    np.testing.assert_allclose(guessed_down(upside_down), DOWN)
+    np.testing.assert_allclose(guessed_gravity(upside_down), DOWN)
 
 
-def test_two_pictures_say_what_they_know_of_up() -> None:
-    known, guessed = mesh_pictures(corner_room(), room_run()), mesh_pictures(corner_room(), room_run(None))
+def test_two_images_say_what_they_know_of_gravity() -> None:
+    known, guessed = (render_mesh_images(corner_room(), room_run(gravity)) for gravity in (DOWN, None))
     assert len(known) == len(guessed) == 2
     assert "by gravity" in known[0].caption
     assert "guessed" in guessed[0].caption
-    for picture in known:
-        colours = picture.image_rgb.reshape(-1, 3).astype(int)
+    for one in known:
+        colours = one.image_rgb.reshape(-1, 3).astype(int)
         red, blue = colours[:, 0] > colours[:, 2] + 60, colours[:, 2] > colours[:, 0] + 60
         assert red.mean() > 0.05
         assert blue.mean() > 0.05
-    again = mesh_pictures(corner_room(), room_run())
+    again = render_mesh_images(corner_room(), room_run())
     for one, other in zip(known, again, strict=True):
         np.testing.assert_array_equal(one.image_rgb, other.image_rgb)
 
@@ -113,8 +113,8 @@ def test_two_pictures_say_what_they_know_of_up() -> None:
 def test_little_is_drawn_of_little(poses: int) -> None:
     run = room_run()
     run = replace(run, trajectory=Trajectory(np.arange(float(poses)), walk()[:poses]))
-    assert mesh_pictures(Mesh.empty(), run) == ()
-    assert len(mesh_pictures(corner_room(), run)) == 2 * poses
+    assert render_mesh_images(Mesh.empty(), run) == ()
+    assert len(render_mesh_images(corner_room(), run)) == 2 * poses
 
 
 def test_the_path_is_broken_where_frames_were_lost() -> None:
@@ -122,30 +122,30 @@ def test_the_path_is_broken_where_frames_were_lost() -> None:
     lost = replace(run, trajectory=Trajectory(np.r_[0.0:5.0, 30.0:35.0], walk()))
     blue = []
     for one in (run, lost):
-        image = mesh_pictures(corner_room(), one)[0].image_rgb.astype(int)
+        image = render_mesh_images(corner_room(), one)[0].image_rgb.astype(int)
         blue.append((np.abs(image - (23, 105, 212)).sum(axis=2) < 30).sum())
     assert 0 < blue[1] < blue[0]
 
 
 def test_the_page_shows_them_and_the_file_has_them_side_by_side(tmp_path: Path) -> None:
     image = np.full((6, 9, 3), (200, 100, 50), np.uint8)
-    pictures = (MeshPicture("One <view>", "What & why.", image), MeshPicture("Other", "Too.", image // 2))
-    data = replace(full_data(), mesh_pictures=pictures)
+    images = (MeshImage("One <view>", "What & why.", image), MeshImage("Other", "Too.", image // 2))
+    data = replace(full_data(), mesh_images=images)
     page = build_html(data, build_summary(data))
     for text in ("One &lt;view&gt;", "What &amp; why.", "Other"):
         assert text in page
     without = build_html(full_data(), build_summary(data))
     assert page.count("data:image/jpeg") == without.count("data:image/jpeg") + 2
-    write_mesh_png(tmp_path / "mesh.png", pictures)
+    write_mesh_png(tmp_path / "mesh.png", images)
     read = read_image_rgb(tmp_path / "mesh.png")
     np.testing.assert_array_equal(read[:, :9], image)
     np.testing.assert_array_equal(read[:, -9:], image // 2)
     assert (read[:, 9:-9] == 255).all()
     with pytest.raises(OutputError, match="cannot be written"):
-        write_mesh_png(tmp_path / "absent" / "mesh.png", pictures)
+        write_mesh_png(tmp_path / "absent" / "mesh.png", images)
 
 
-def test_no_mesh_no_picture_and_the_page_says_so() -> None:
+def test_the_page_says_that_there_is_no_mesh() -> None:
     page = build_html(bare_data(), build_summary(bare_data()))
-    assert "no picture of one" in page
-    assert "no picture of one" not in build_html(full_data(), build_summary(full_data()))
+    assert "no image of one" in page
+    assert "no image of one" not in build_html(full_data(), build_summary(full_data()))

@@ -38,7 +38,7 @@ def data_stats_command(
     Example: slamdepth data-stats depth_training rgbd_dataset_freiburg1_rpy --output data-stats
     """
     from slamdepth.pipeline.data_stats import data_statistics
-    from slamdepth.report.data_stats import PAGE, PICTURE, data_tables
+    from slamdepth.report.data_stats import HISTOGRAMS, PAGE, data_tables
 
     with stop_on_signals() as stop, JobBar(quiet) as bar:
         about = data_statistics(
@@ -52,5 +52,5 @@ def data_stats_command(
             for note in one["notes"]:
                 out.print(f"note: {one['name']}: {note}", style="yellow", markup=False)
         if output is not None:
-            for name in (PAGE, PICTURE, "data-stats.json"):
+            for name in (PAGE, HISTOGRAMS, "data-stats.json"):
                 out.print(str(output / name), markup=False, soft_wrap=True)

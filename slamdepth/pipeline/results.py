@@ -15,7 +15,7 @@ from slamdepth.evaluation import DepthScore, DepthScorer, TrajectoryScore, score
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, Stage
-from slamdepth.report import MeshCounts, MeshPicture, mesh_pictures
+from slamdepth.report import MeshCounts, MeshImage, render_mesh_images
 from slamdepth.types import DepthKind, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ def keyframe_trajectory(reconstruction: Reconstruction) -> Trajectory:
 
 def write_keyframe_mesh(
     reconstruction: Reconstruction, config: Config, path: Path, progress: ProgressCallback
-) -> tuple[MeshCounts | None, tuple[MeshPicture, ...], tuple[str, ...]]:
+) -> tuple[MeshCounts | None, tuple[MeshImage, ...], tuple[str, ...]]:
     """Fuse the keyframes and write the mesh.
 
     Returns:
@@ -59,7 +59,7 @@ def write_keyframe_mesh(
         return None, (), mesh.notes
     mesh.save(path)
     counts = MeshCounts(len(mesh.vertices_m), len(mesh.triangles))
-    return counts, mesh_pictures(mesh, reconstruction), mesh.notes
+    return counts, render_mesh_images(mesh, reconstruction), mesh.notes
 
 
 def judge_trajectory(

@@ -15,7 +15,7 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
-from slamdepth.depth.base import DepthModel
+from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.depth.scale_file import write_scale
 from slamdepth.errors import DatasetError, OutputError, SlamdepthError
@@ -42,7 +42,7 @@ from slamdepth.pipeline.results import (
 )
 from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.tracking import Tracked, track
-from slamdepth.report import MeshCounts, MeshPicture, ReportData, write_mesh_png, write_report
+from slamdepth.report import MeshCounts, MeshImage, ReportData, write_mesh_png, write_report
 
 logger = logging.getLogger(__name__)
 
@@ -157,22 +157,20 @@ def _finish(
     notes = [*dataset.notes, *tracked.notes, *scale_notes]
 
     mesh: MeshCounts | None = None
-    pictures: tuple[MeshPicture, ...] = ()
+    images: tuple[MeshImage, ...] = ()
     if options.mesh:
         tell(RunProgress(Stage.MESHING))
         try:
-            mesh, pictures, mesh_notes = write_keyframe_mesh(
-                reconstruction, config, folder / "mesh.ply", tell
-            )
+            mesh, images, mesh_notes = write_keyframe_mesh(reconstruction, config, folder / "mesh.ply", tell)
         except SlamdepthError as error:
             mesh_notes = (f"no mesh: {error}",)
         for note in mesh_notes:
             logger.warning("%s", note)
         notes += mesh_notes
-    if pictures:
-        write_mesh_png(folder / "mesh.png", pictures)
+    if images:
+        write_mesh_png(folder / "mesh.png", images)
 
-    optional = (("mesh.ply", mesh), ("mesh.png", pictures), ("depth_scale.yaml", scale.fit))
+    optional = (("mesh.ply", mesh), ("mesh.png", images), ("depth_scale.yaml", scale.fit))
     absent = {name for name, is_there in optional if not is_there}
     tell(RunProgress(Stage.SCORING))
     trajectory_score, score_notes = judge_trajectory(
@@ -184,6 +182,7 @@ def _finish(
         ReportData(
             sequence=dataset.name,
             depth_model=model.name,
+            depth_is_measured=is_sensor(model),
             reconstruction=reconstruction,
             fps=tracked.fps,
             config=config,
@@ -193,7 +192,7 @@ def _finish(
             trajectory_score=trajectory_score,
             depth_score=score_depth(dataset, reconstruction.keyframes),
             mesh=mesh,
-            mesh_pictures=pictures,
+            mesh_images=images,
             skipped_frames=tracked.skipped,
             notes=tuple(notes),
             options=_reported_options(options, tracked),

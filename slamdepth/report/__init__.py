@@ -6,21 +6,21 @@ from __future__ import annotations
 from slamdepth.report.console import run_table, scale_table, trajectory_table
 from slamdepth.report.data import MeshCounts, ReportData
 from slamdepth.report.html import build_html
-from slamdepth.report.mesh_images import MeshPicture, mesh_pictures, write_mesh_png
+from slamdepth.report.mesh_images import MeshImage, render_mesh_images, write_mesh_png
 from slamdepth.report.scale import ScaleFacts, ScalePart, ScaleSource
 from slamdepth.report.summary import build_summary
 from slamdepth.report.write import write_report
 
 __all__ = [
     "MeshCounts",
-    "MeshPicture",
+    "MeshImage",
     "ReportData",
     "ScaleFacts",
     "ScalePart",
     "ScaleSource",
     "build_html",
     "build_summary",
-    "mesh_pictures",
+    "render_mesh_images",
     "run_table",
     "scale_table",
     "trajectory_table",

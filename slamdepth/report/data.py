@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from slamdepth.config import Config
 from slamdepth.evaluation import DepthScore, TrajectoryScore
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.report.mesh_images import MeshPicture
+from slamdepth.report.mesh_images import MeshImage
 from slamdepth.report.scale import ScaleFacts
 from slamdepth.types import StepResult, WeightsInfo
 
@@ -27,23 +27,25 @@ class ReportData:
 
     Attributes:
         sequence: name of the sequence, not its path.
-        depth_model: registered name of the depth model, or ``sensor``.
+        depth_model: name of the depth model.
+        depth_is_measured: True where a sensor measured the depth rather than a network predicted it.
         reconstruction: what the tracker returned.
-        fps: frames over the wall time of tracking, meshing apart.
+        fps: frames over the wall time of tracking, without meshing.
         config: every setting of the run.
         scale: is the map metric, and how was its scale found.
         weights: every weights file that took part, and the data each has seen.
         steps: one result for each frame, in order; empty where they were not kept.
         trajectory_score, depth_score, mesh: None where there is none.
-        mesh_pictures: views of the mesh; empty where there is none.
+        mesh_images: views of the mesh; empty where there is none.
         skipped_frames: images that could not be read: damaged, or missing.
         notes: what was guessed, dropped or repaired, one line each.
-        options: what was asked on the command line beside the settings.
+        options: what was asked for in addition to the settings.
         files: what each file of the run folder holds, by file name.
     """
 
     sequence: str
     depth_model: str
+    depth_is_measured: bool
     reconstruction: Reconstruction
     fps: float
     config: Config
@@ -53,7 +55,7 @@ class ReportData:
     trajectory_score: TrajectoryScore | None = None
     depth_score: DepthScore | None = None
     mesh: MeshCounts | None = None
-    mesh_pictures: tuple[MeshPicture, ...] = ()
+    mesh_images: tuple[MeshImage, ...] = ()
     skipped_frames: int = 0
     notes: tuple[str, ...] = ()
     options: dict[str, object] = field(default_factory=dict)

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Data sets with depth side by side: a picture, a page, and tables for a terminal."""
+"""Data sets with depth side by side: histograms, a page, and tables for a terminal."""
 
 from __future__ import annotations
 
-import base64
 from dataclasses import dataclass
-from html import escape
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +13,7 @@ from slamdepth.evaluation.depth_statistics import DepthStatistics
 from slamdepth.io import replacing, write_text
 from slamdepth.report.figure import new_figure, to_png
 from slamdepth.report.keyframe_images import near_to_far
-from slamdepth.report.markup import section, table
+from slamdepth.report.page import data_address, render
 from slamdepth.report.text import MISSING, count, fixed, percent
 from slamdepth.types import Camera
 
@@ -24,7 +21,7 @@ if TYPE_CHECKING:
     from rich.console import JustifyMethod
     from rich.table import Table
 
-PICTURE, PAGE = "histograms.png", "data-stats.html"
+HISTOGRAMS, PAGE = "histograms.png", "data-stats.html"
 _INK, _MUTED, _RULE, _BAR = "#14181f", "#5b6575", "#dfe3e9", "#9aa5b4"
 _BINS = 80
 _LONGEST_NAME = 32
@@ -106,14 +103,14 @@ def write_data_page(folder: Path, rows: list[DataRow], about: dict[str, Any]) ->
     Raises:
         OutputError: it cannot be written.
     """
-    png = histogram_picture(rows)
-    with replacing(folder / PICTURE) as temporary:
+    png = histogram_image(rows)
+    with replacing(folder / HISTOGRAMS) as temporary:
         temporary.write_bytes(png)
     write_text(folder / PAGE, _page(png, about))
 
 
-def histogram_picture(rows: list[DataRow]) -> bytes:
-    """A PNG: a histogram of depth for each data set over one axis, and its sparsity beside it."""
+def histogram_image(rows: list[DataRow]) -> bytes:
+    """A PNG: a histogram of depth for each data set over one axis, and next to it the sparsity."""
     import matplotlib
 
     style = {
@@ -193,30 +190,11 @@ def _sparsity(panel: Any, row: DataRow) -> None:
 
 
 def _page(png: bytes, about: dict[str, Any]) -> str:
-    css = resources.files("slamdepth.report").joinpath("report.css").read_text(encoding="utf-8")
-    picture = (
-        f'<figure><img style="width: 100%; background: white; border-radius: 6px" alt="depth histograms" '
-        f'src="data:image/png;base64,{base64.b64encode(png).decode("ascii")}"></figure>'
-    )
-    notes = [f"{one['name']}: {note}" for one in about["sets"] for note in one["notes"]]
-    listed = "".join(f"<li>{escape(note)}</li>" for note in notes)
-    looked = "every image" if about["stride"] == 1 else f"every {about['stride']}th image"
-    if about["max_frames"] is not None:
-        looked += f", at most {about['max_frames']} of each, spread evenly over it"
-    sparsity = (
-        "Pairs: how many the figures are of, of how many there are. f: focal length; view: across. "
-        "No depth: share of all pixels; per image: from the densest to the sparsest."
-    )
-    body = section("Depths", "Known depth along the optical axis, over one axis for all.", picture)
-    body += section("How much, how sparse, which lens", sparsity, table(*overview_rows(about)))
-    body += section("Ranges", "Percentiles of the known pixels.", table(*range_rows(about)))
-    if notes:
-        body += section("Notes", "What was guessed, repaired or left out.", f"<ul>{listed}</ul>")
-    return (
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>depth data · slamdepth</title>\n<style>\n{css}</style>\n</head>\n<body>\n<main>\n"
-        f'<header><div class="product">slamdepth {escape(about["slamdepth"])} · depth data</div>'
-        f"<h1>{len(about['sets'])} data sets side by side</h1>"
-        f'<p class="lead">{escape(looked)}</p></header>\n{body}</main>\n</body>\n</html>\n'
+    return render(
+        "data_stats.html.j2",
+        about=about,
+        histograms=data_address(png, "image/png"),
+        overview=overview_rows(about),
+        ranges=range_rows(about),
+        notes=[f"{one['name']}: {note}" for one in about["sets"] for note in one["notes"]],
     )

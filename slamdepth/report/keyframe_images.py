@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes as small pictures: the image, its depth in colour, and the sensor's where there is one."""
+"""Keyframes as small images: the colour image, its depth in colour, and the sensor's where there is one."""
 
 from __future__ import annotations
 
-import base64
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from slamdepth.report.page import data_address
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,38 +23,44 @@ _WIDTH_PX = 320
 
 
 @dataclass(frozen=True)
-class KeyframePicture:
-    """Pictures of one keyframe as ``data:`` addresses.
+class KeyframeImages:
+    """Images of one keyframe.
 
     Attributes:
+        id: number of the keyframe.
         seconds: since the first keyframe.
-        sensor: None where there is no sensor, or where ``depth`` is its own.
+        images: a ``data:`` address for each name: ``image``, ``depth`` and, unless the depth is measured
+            or there is no sensor, ``sensor depth``.
     """
 
     id: int
     seconds: float
-    image: str
-    depth: str
-    sensor: str | None
+    images: dict[str, str]
 
 
 @dataclass(frozen=True)
 class Gallery:
-    """Pictures of some keyframes under one colour scale from ``near_m`` to ``far_m``."""
+    """Images of some keyframes under one colour scale from ``near_m`` to ``far_m`` metres."""
 
-    pictures: tuple[KeyframePicture, ...]
+    keyframes: tuple[KeyframeImages, ...]
     near_m: float
     far_m: float
+
+    @property
+    def has_sensor(self) -> bool:
+        """True where a keyframe shows the sensor's depth next to the prediction."""
+        return any("sensor depth" in keyframe.images for keyframe in self.keyframes)
 
 
 def colour_depth(
     depth_m: NDArray[np.floating], near_m: float, far_m: float, known: NDArray[np.bool_] | None = None
 ) -> NDArray[np.uint8]:
-    """Colours ``(H, W, 3)`` RGB of depth ``(H, W)`` in metres, from dark blue at ``near_m`` to
-    yellow at ``far_m``; grey where it is 0 or not finite.
+    """Colours ``(H, W, 3)`` uint8 RGB of a depth map.
 
-    Values of another unit are coloured alike, also where ``near_m`` is the larger one (inverse
-    depth); then ``known (H, W)`` says which pixels have a value, for 0 may be one.
+    Args:
+        depth_m: ``(H, W)`` metres. Values of another unit are coloured in the same way.
+        near_m, far_m: drawn dark blue and yellow. ``near_m`` may be the larger one (inverse depth).
+        known: ``(H, W)``, which pixels have a value; the others are grey. Default: finite and above 0.
     """
     anchors = np.array([rgb_of(colour) for colour in NEAR_TO_FAR], dtype=np.float64)
     if known is None:
@@ -76,7 +83,7 @@ def near_to_far() -> Any:
 
 
 def keyframe_gallery(keyframes: tuple[Keyframe, ...], count: int = 4) -> Gallery | None:
-    """Pictures of ``count`` keyframes spread evenly over the run, or None where there are none."""
+    """Images of ``count`` keyframes spread evenly over the run; None where there are no keyframes."""
     if not keyframes:
         return None
     spread = np.linspace(0, len(keyframes) - 1, count).round().astype(int)
@@ -84,20 +91,19 @@ def keyframe_gallery(keyframes: tuple[Keyframe, ...], count: int = 4) -> Gallery
     known = np.concatenate([d[np.isfinite(d) & (d > 0)][::16] for d in (k.load_depth_m() for k in chosen)])
     near_m, far_m = (float(v) for v in np.percentile(known, (1, 98))) if len(known) else (0.0, 1.0)
     start_s = keyframes[0].frame.timestamp_s
-    pictures = tuple(_picture(k, start_s, near_m, far_m) for k in chosen)
-    return Gallery(pictures, near_m, far_m)
+    return Gallery(tuple(_images_of(k, start_s, near_m, far_m) for k in chosen), near_m, far_m)
 
 
-def _picture(keyframe: Keyframe, start_s: float, near_m: float, far_m: float) -> KeyframePicture:
+def _images_of(keyframe: Keyframe, start_s: float, near_m: float, far_m: float) -> KeyframeImages:
     frame = keyframe.frame.load()
+    images = {
+        "image": _small(frame.image_rgb, smooth=True),
+        "depth": _small(colour_depth(keyframe.load_depth_m(), near_m, far_m), smooth=False),
+    }
     sensor_m = None if keyframe.prediction.is_sensor else frame.depth_m
-    return KeyframePicture(
-        id=keyframe.id,
-        seconds=frame.timestamp_s - start_s,
-        image=_small(frame.image_rgb, smooth=True),
-        depth=_small(colour_depth(keyframe.load_depth_m(), near_m, far_m), smooth=False),
-        sensor=None if sensor_m is None else _small(colour_depth(sensor_m, near_m, far_m), smooth=False),
-    )
+    if sensor_m is not None:
+        images["sensor depth"] = _small(colour_depth(sensor_m, near_m, far_m), smooth=False)
+    return KeyframeImages(keyframe.id, frame.timestamp_s - start_s, images)
 
 
 def _small(image_rgb: NDArray[np.uint8], *, smooth: bool) -> str:
@@ -110,11 +116,11 @@ def _small(image_rgb: NDArray[np.uint8], *, smooth: bool) -> str:
 
 
 def jpeg_address(image_rgb: NDArray[np.uint8]) -> str:
-    """The picture ``(H, W, 3)`` as a JPEG in a ``data:`` address."""
+    """The image ``(H, W, 3)`` uint8 RGB as a JPEG in a ``data:`` address."""
     import cv2
 
     _, data = cv2.imencode(".jpg", image_rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 84])
-    return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
+    return data_address(data.tobytes(), "image/jpeg")
 
 
 def rgb_of(colour: str) -> tuple[int, int, int]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the finished mesh: as a whole, and as somebody behind the camera would see it."""
+"""Images of the finished mesh: as a whole, and from behind the camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from slamdepth.geometry import invert, project, transform
 from slamdepth.io import write_png
 from slamdepth.mapping.raycast import render_mesh
 from slamdepth.report.gaps import gap_ends
-from slamdepth.report.viewpoints import from_above, guessed_down, over_the_shoulder, picture_camera
+from slamdepth.report.viewpoints import from_above, guessed_gravity, ideal_camera, over_the_shoulder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +30,7 @@ _STRIPE = 8  # pixels
 
 
 @dataclass(frozen=True)
-class MeshPicture:
+class MeshImage:
     """One view of a mesh.
 
     Attributes:
@@ -44,11 +44,11 @@ class MeshPicture:
     image_rgb: NDArray[np.uint8]
 
 
-def mesh_pictures(mesh: Mesh, run: Reconstruction) -> tuple[MeshPicture, ...]:
-    """Views of ``mesh``, none where it has no triangle or ``run`` no pose.
+def render_mesh_images(mesh: Mesh, run: Reconstruction) -> tuple[MeshImage, ...]:
+    """Views of ``mesh``; none where it has no triangle or ``run`` no pose.
 
-    Up is against gravity where ``run`` knows it, else guessed from how the camera was held; a picture
-    claims nothing about that.
+    Up is against gravity. Where ``run`` has no gravity it is guessed from how the camera was held, and
+    the caption says so.
 
     Raises:
         SlamdepthError: Open3D is not installed.
@@ -56,17 +56,17 @@ def mesh_pictures(mesh: Mesh, run: Reconstruction) -> tuple[MeshPicture, ...]:
     poses = run.trajectory.T_world_camera
     if len(mesh.triangles) == 0 or len(poses) == 0:
         return ()
-    down_w = guessed_down(poses) if run.gravity_w is None else run.gravity_w
+    gravity_w = guessed_gravity(poses) if run.gravity_w is None else run.gravity_w
     level = (
         "upright by gravity"
         if run.gravity_w is not None
         else "which way is up is guessed from how the camera was held"
     )
-    wide = picture_camera(_WIDTH, _HEIGHT, 50.0)
-    T = from_above(mesh, poses[:, :3, 3], down_w, wide)
+    wide = ideal_camera(_WIDTH, _HEIGHT, 50.0)
+    T = from_above(mesh, poses[:, :3, 3], gravity_w, wide)
     whole = render_mesh(mesh, wide, T, _BACKGROUND)
-    pictures = [
-        MeshPicture(
+    images = [
+        MeshImage(
             "The whole mesh, from above and behind the camera",
             f"The path of the camera is blue, with a dot at its start; {level}. Surfaces seen from behind "
             "are left out, so that one looks through walls and ceilings into the room. Nothing is drawn "
@@ -74,34 +74,34 @@ def mesh_pictures(mesh: Mesh, run: Reconstruction) -> tuple[MeshPicture, ...]:
             _with_path(whole, run.trajectory, wide, T),
         )
     ]
-    near = picture_camera(_WIDTH, _HEIGHT, 65.0)
-    if (behind := over_the_shoulder(mesh, poses, down_w, near)) is not None:
-        pictures.append(
-            MeshPicture(
+    near = ideal_camera(_WIDTH, _HEIGHT, 65.0)
+    if (behind := over_the_shoulder(mesh, poses, gravity_w, near)) is not None:
+        images.append(
+            MeshImage(
                 "Over the camera's shoulder",
                 "A step behind that place of the path from which most of the mesh is seen; to be compared "
                 "with the images.",
                 render_mesh(mesh, near, behind, _BACKGROUND),
             )
         )
-    return tuple(pictures)
+    return tuple(images)
 
 
-def write_mesh_png(path: Path, pictures: tuple[MeshPicture, ...]) -> None:
-    """Write the pictures side by side, a white stripe between them.
+def write_mesh_png(path: Path, images: tuple[MeshImage, ...]) -> None:
+    """Write the images side by side, a white stripe between them.
 
     Raises:
         OutputError: ``path`` cannot be written.
     """
-    stripe = np.full((pictures[0].image_rgb.shape[0], _STRIPE, 3), 255, np.uint8)
-    row = [part for picture in pictures for part in (stripe, picture.image_rgb)]
+    stripe = np.full((images[0].image_rgb.shape[0], _STRIPE, 3), 255, np.uint8)
+    row = [part for image in images for part in (stripe, image.image_rgb)]
     write_png(path, np.hstack(row[1:]))
 
 
 def _with_path(
     image_rgb: NDArray[np.uint8], trajectory: Trajectory, camera: Camera, T_world_camera: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """The picture with the path drawn over it, broken where frames were lost."""
+    """The image with the path drawn over it, broken where frames were lost."""
     import cv2
 
     px, _ = project(camera, transform(invert(T_world_camera), trajectory.T_world_camera[:, :3, 3]))

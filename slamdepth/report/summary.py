@@ -18,6 +18,7 @@ def build_summary(data: ReportData) -> dict[str, Any]:
     return {
         "sequence": data.sequence,
         "depth_model": data.depth_model,
+        "depth_is_measured": data.depth_is_measured,
         "features": data.config.features.name if data.config.odometry == "orb" else None,
         "scale": data.scale.to_dict(),
         "frames": statistics.frames,

@@ -21,22 +21,22 @@ if TYPE_CHECKING:
 
 _ELEVATION = math.radians(35.0)
 _AZIMUTHS = 36
-_MARGIN = 0.92  # of the picture is filled
+_MARGIN = 0.92  # of the image is filled
 _STRAYS = 1.0  # per cent of the mesh that may lie beyond each edge
 _POSES = 30
 _BACK, _UP = 0.35, 0.1  # of the distance to what a camera saw
-_STEEPEST = 0.94  # cosine to gravity, beyond which a picture's horizon means nothing
+_STEEPEST = 0.94  # cosine to gravity, beyond which an image's horizon means nothing
 _MOST = 20_000  # triangles and vertices that are looked at
 _SPREAD = 0.02  # mean square of x axes out of a plane, beyond which cameras were not held level
 
 
-def picture_camera(width: int, height: int, across_deg: float) -> Camera:
+def ideal_camera(width: int, height: int, across_deg: float) -> Camera:
     """An ideal camera of ``width`` x ``height`` pixels that sees ``across_deg`` from left to right."""
     focal = width / 2 / math.tan(math.radians(across_deg) / 2)
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def guessed_down(T_world_camera: Floats) -> Floats:
+def guessed_gravity(T_world_camera: Floats) -> Floats:
     """Direction of gravity ``(3,)`` in the world, as if the cameras ``(N, 4, 4)`` were held level.
 
     The x axis of a level camera is level, however it is turned and tipped (Brown and Lowe, "Automatic
@@ -53,17 +53,17 @@ def guessed_down(T_world_camera: Floats) -> Floats:
     return np.asarray(down if is_level else y)
 
 
-def from_above(mesh: Mesh, path_w: Floats, down_w: Floats, camera: Camera) -> Floats:
+def from_above(mesh: Mesh, path_w: Floats, gravity_w: Floats, camera: Camera) -> Floats:
     """``T_world_camera (4, 4)`` obliquely from above, from the side that shows most of the mesh's front.
 
-    That is behind the camera which saw it. Mesh and path are in the picture as a whole, strays apart.
+    That is behind the camera which saw it. All of mesh and path is in the image, except for strays.
 
     Args:
         path_w: ``(N, 3)`` positions of the camera in the world.
-        down_w: ``(3,)`` unit direction of gravity in the world.
+        gravity_w: ``(3,)`` unit direction of gravity in the world.
     """
     corner, normals = _triangles(mesh)
-    right, down, forward = level_axes(down_w)
+    right, down, forward = level_axes(gravity_w)
     angles = np.linspace(0.0, 2 * np.pi, _AZIMUTHS, endpoint=False)[:, None]
     level = np.cos(angles) * forward + np.sin(angles) * right
     ahead = math.cos(_ELEVATION) * level + math.sin(_ELEVATION) * down
@@ -71,11 +71,11 @@ def from_above(mesh: Mesh, path_w: Floats, down_w: Floats, camera: Camera) -> Fl
     return _fitted(corner, path_w, look_at(np.zeros(3), ahead[int(shown.argmax())], down), camera)
 
 
-def over_the_shoulder(mesh: Mesh, T_world_camera: Floats, down_w: Floats, camera: Camera) -> Floats | None:
+def over_the_shoulder(mesh: Mesh, T_world_camera: Floats, gravity_w: Floats, camera: Camera) -> Floats | None:
     """``T_world_camera (4, 4)`` a step behind that pose ``(N, 4, 4)`` of the path from which most of the
     mesh's front is seen; None where each looks straight down or up, or at nothing.
 
-    The picture is level, whatever the pose was.
+    The image is level, whatever the pose was.
     """
     corner, normals = _triangles(mesh)
     best, most = None, 0.0
@@ -84,11 +84,11 @@ def over_the_shoulder(mesh: Mesh, T_world_camera: Floats, down_w: Floats, camera
         ahead = pose[:3, 2]
         z = (corner - pose[:3, 3]) @ ahead
         seen = z[_inside(corner, pose, camera)]
-        if len(seen) == 0 or abs(ahead @ down_w) > _STEEPEST:
+        if len(seen) == 0 or abs(ahead @ gravity_w) > _STEEPEST:
             continue
         reach = float(np.median(seen))
-        eye = pose[:3, 3] - reach * (_BACK * ahead + _UP * down_w)
-        T = look_at(eye, pose[:3, 3] + reach * ahead, down_w)
+        eye = pose[:3, 3] - reach * (_BACK * ahead + _UP * gravity_w)
+        T = look_at(eye, pose[:3, 3] + reach * ahead, gravity_w)
         towards = eye - corner
         towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
         front = np.maximum(np.einsum("ij,ij->i", normals, towards), 0.0)
@@ -106,14 +106,14 @@ def _triangles(mesh: Mesh) -> tuple[Floats, Floats]:
 
 
 def _inside(points: Floats, T_world_camera: Floats, camera: Camera) -> NDArray[np.bool_]:
-    """Which ``points (N, 3)`` of the world are in the picture."""
+    """Which ``points (N, 3)`` of the world are in the image."""
     p = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     half = np.array([camera.width / camera.fx, camera.height / camera.fy]) / 2
     return np.asarray((np.abs(p[:, :2]) < half * p[:, 2:]).all(axis=1))
 
 
 def _fitted(points: Floats, path_w: Floats, T_world_camera: Floats, camera: Camera) -> Floats:
-    """The camera moved, not turned, to where it has both in the picture, as near as that allows."""
+    """The camera moved, not turned, to where it has both in the image, as near as that allows."""
     T = T_world_camera.copy()
     p, path = points @ T[:3, :3], path_w @ T[:3, :3]
     half = np.array([camera.width / camera.fx, camera.height / camera.fy]) / 2 * _MARGIN
