@@ -70,7 +70,7 @@ def photos(folder: Path, count: int = 3, side: tuple[int, int] = (64, 48)) -> Pa
     return folder
 
 
-def film(path: Path, count: int = 6) -> Path:
+def video(path: Path, count: int = 6) -> Path:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (64, 48))
     for i in range(count):
         writer.write(np.full((48, 64, 3), 20 * i, np.uint8))
@@ -126,13 +126,13 @@ def test_a_guessed_focal_length_is_named_everywhere(tmp_path: Path, caplog: pyte
     assert "a guess: 60 degrees" in caplog.text
 
 
-@pytest.mark.parametrize("beside", [True, False])
-def test_a_camera_file_ends_the_guess(beside: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("in_folder", [True, False])
+def test_a_camera_file_ends_the_guess(in_folder: bool, tmp_path: Path) -> None:
     folder = tmp_path / "in"
     write_image(folder / "a.png", image_rgb(0))
-    camera_file = (folder if beside else tmp_path) / "camera.yaml"
+    camera_file = (folder if in_folder else tmp_path) / "camera.yaml"
     write_camera(camera_file, CAMERA)
-    about = make(folder, tmp_path / "out", camera_file=None if beside else camera_file)
+    about = make(folder, tmp_path / "out", camera_file=None if in_folder else camera_file)
     (group,) = about["intrinsics"]
     assert (group["fx"], group["certainty"]) == (20.0, "given")
     assert "guess" not in about["scale"]
@@ -166,9 +166,9 @@ def test_relative_depth_gets_no_metres(tmp_path: Path) -> None:
     assert colour[0].sum() > 2 * colour[-1].sum()  # small inverse depth is far, so bright
 
 
-def test_a_film_keeps_one_range_and_a_folder_does_not(tmp_path: Path) -> None:
-    out = tmp_path / "film"
-    about = make(film(tmp_path / "v.mp4"), out, stride=2)
+def test_a_video_keeps_one_range_and_a_folder_does_not(tmp_path: Path) -> None:
+    out = tmp_path / "maps"
+    about = make(video(tmp_path / "v.mp4"), out, stride=2)
     assert about["frames"] == 3
     assert about["source"]["frames_per_second"] == pytest.approx(5.0)
     assert (about["colours"]["near"], about["colours"]["far"]) == pytest.approx((1.0, 3.0), abs=0.04)
@@ -228,10 +228,10 @@ def test_only_what_is_missing_is_predicted_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("after", [1, 4, 8])
-def test_a_stopped_film_goes_on_to_the_same_bytes(after: int, tmp_path: Path) -> None:
+def test_a_stopped_video_goes_on_to_the_same_bytes(after: int, tmp_path: Path) -> None:
     """Stopped while predicting, between the passes, and while drawing."""
-    video = film(tmp_path / "v.mp4")
-    make(video, tmp_path / "whole")
+    source = video(tmp_path / "v.mp4")
+    make(source, tmp_path / "whole")
     stop, calls = threading.Event(), []
 
     def count(*state: object) -> None:
@@ -240,7 +240,7 @@ def test_a_stopped_film_goes_on_to_the_same_bytes(after: int, tmp_path: Path) ->
             stop.set()
 
     out = tmp_path / "out"
-    options = DepthMapOptions(video, out, METRIC)
+    options = DepthMapOptions(source, out, METRIC)
     with pytest.raises(DepthMapsInterrupted, match="the same command goes on") as stopped:
         make_depth_maps(options, progress=count, stop=stop)
     assert stopped.value.exit_code == 130
@@ -255,11 +255,11 @@ def test_a_stopped_film_goes_on_to_the_same_bytes(after: int, tmp_path: Path) ->
         assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
 
 
-def test_more_frames_of_a_film_can_be_asked_for_later(tmp_path: Path) -> None:
-    video = film(tmp_path / "v.mp4")
-    make(video, tmp_path / "out", max_frames=2)
+def test_more_frames_of_a_video_can_be_asked_for_later(tmp_path: Path) -> None:
+    source = video(tmp_path / "v.mp4")
+    make(source, tmp_path / "out", max_frames=2)
     SEEN.clear()
-    assert make(video, tmp_path / "out")["film"]["frames"] == 6
+    assert make(source, tmp_path / "out")["video"]["frames"] == 6
     assert SEEN == [2, 3, 4, 5]
 
 
@@ -309,7 +309,7 @@ def test_a_sequence_brings_camera_and_sensor(tmp_path: Path) -> None:
     np.testing.assert_allclose(values, raw / 5000.0, rtol=1e-6)
 
 
-def test_depth_images_of_training_pairs_are_no_pictures(tmp_path: Path) -> None:
+def test_depth_images_of_training_pairs_are_no_colour_images(tmp_path: Path) -> None:
     about = make(pairs(tmp_path / "place"), tmp_path / "out")
     assert about["frames"] == 2
     assert about["intrinsics"][0]["how"] == "camera.json of the pairs"
@@ -327,7 +327,7 @@ def pairs(folder: Path) -> Path:
 def test_bad_input_is_one_clear_error_and_leaves_nothing(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (tmp_path / "empty").mkdir()
-    (tmp_path / "bad.mp4").write_bytes(b"no film at all")
+    (tmp_path / "bad.mp4").write_bytes(b"no video at all")
     (tmp_path / "notes.txt").write_text("hello")
     foreign = photos(tmp_path / "foreign")
     cases: list[tuple[Path, dict[str, Any], type[InputError], str]] = [
@@ -349,7 +349,9 @@ def test_bad_input_is_one_clear_error_and_leaves_nothing(tmp_path: Path) -> None
     assert len(list(foreign.iterdir())) == 3
 
 
-def test_a_full_disk_is_told_after_the_first_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_after_the_first_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from types import SimpleNamespace
 
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
@@ -361,7 +363,7 @@ def test_a_full_disk_is_told_after_the_first_image(tmp_path: Path, monkeypatch: 
 @pytest.mark.parametrize(
     ("cloud", "said"), [(True, r"--no-cloud leaves out \d\d% of that"), (False, "--stride and --max-frames")]
 )
-def test_many_gigabytes_are_told_after_the_first_image(
+def test_many_gigabytes_are_reported_after_the_first_image(
     cloud: bool, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     source = photos(tmp_path / "in")
@@ -369,14 +371,14 @@ def test_many_gigabytes_are_told_after_the_first_image(
     assert "GB" not in caplog.text
     monkeypatch.setattr("slamdepth.pipeline.depth_maps.job._MUCH_BYTES", 1000)
     about = make(source, tmp_path / "large", cloud=cloud)
-    (told,) = [record.getMessage() for record in caplog.records if "GB" in record.getMessage()]
+    (warning,) = [record.getMessage() for record in caplog.records if "GB" in record.getMessage()]
     assert re.fullmatch(
-        rf"{about['frames'] - 1} images? still to do, about .* GB, .* GB free; {said}.*", told
+        rf"{about['frames'] - 1} images? still to do, about .* GB, .* GB free; {said}.*", warning
     )
 
 
-def test_images_far_apart_make_a_film_of_a_second_each(tmp_path: Path) -> None:
-    make(film(tmp_path / "v.mp4", count=6), tmp_path / "out", stride=100_000)
+def test_images_far_apart_are_shown_for_a_second_each(tmp_path: Path) -> None:
+    make(video(tmp_path / "v.mp4", count=6), tmp_path / "out", stride=100_000)
     made = cv2.VideoCapture(str(tmp_path / "out" / "side-by-side.mp4"))
     assert made.get(cv2.CAP_PROP_FPS) == 1.0
     assert made.read()[0]
@@ -424,7 +426,7 @@ def test_ctrl_c_is_one_line_and_code_130(number: signal.Signals, tiny_room: Path
         ("mirrored:onnx:/home/a:b/net.onnx", "mirrored:onnx:net.onnx"),
     ],
 )
-def test_a_model_s_public_name_tells_no_folder(name: str, public: str) -> None:
+def test_a_models_public_name_has_no_folder(name: str, public: str) -> None:
     model = SensorDepth()
     model.name = name
     assert public_name(model) == public

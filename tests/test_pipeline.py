@@ -14,7 +14,7 @@ from made_up import MadeUpDataset, MadeUpTracker
 from slamdepth.config import Config
 from slamdepth.errors import CameraError, ConfigError, DatasetError, ImageDecodeError
 from slamdepth.io import read_tum_trajectory
-from slamdepth.pipeline import RunInterrupted, RunOptions, RunProgress, Stage, tracking
+from slamdepth.pipeline import RunInterrupted, RunOptions, RunProgress, RunStage, tracking
 from slamdepth.pipeline.prefetch import FramePrefetcher, ReadFrame
 from slamdepth.pipeline.run import _settings_text
 from slamdepth.pipeline.tracking import Tracked, track
@@ -137,15 +137,15 @@ def test_an_image_of_another_size_ends_the_run(tmp_path: Path) -> None:
         tracked_of(dataset, MadeUpTracker(), tmp_path)
 
 
-def test_progress_is_told(tmp_path: Path) -> None:
+def test_progress_is_reported(tmp_path: Path) -> None:
     states: list[RunProgress] = []
     tracked_of(MadeUpDataset(4, broken=(2,)), MadeUpTracker(), tmp_path, progress=states.append)
     assert [(state.stage, state.done, state.total) for state in states] == [
-        (Stage.TRACKING, 0, 4),
-        (Stage.TRACKING, 1, 4),
-        (Stage.TRACKING, 2, 4),
-        (Stage.TRACKING, 4, 4),
-        (Stage.OPTIMISING, 4, 4),
+        (RunStage.TRACKING, 0, 4),
+        (RunStage.TRACKING, 1, 4),
+        (RunStage.TRACKING, 2, 4),
+        (RunStage.TRACKING, 4, 4),
+        (RunStage.OPTIMISING, 4, 4),
     ]
 
 
@@ -170,12 +170,12 @@ def test_the_settings_file_gives_the_same_settings_again(tmp_path: Path) -> None
     assert Config.from_yaml(tmp_path / "config.yaml") == config
 
 
-@pytest.mark.parametrize(("broken", "told"), [(5, 0), (6, 1), (9, 1)])
-def test_counting_is_told_only_where_more_images_follow(
-    broken: int, told: int, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(("broken", "messages"), [(5, 0), (6, 1), (9, 1)])
+def test_counting_is_announced_only_where_more_images_follow(
+    broken: int, messages: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING, "slamdepth"):
         for number in range(1, broken + 1):
             tracking._warn(ImageDecodeError(f"{number}.png: cannot be read"), number)
-    assert caplog.text.count("are only counted") == told
+    assert caplog.text.count("are only counted") == messages
     assert caplog.text.count("image skipped: ") == min(broken, 5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run folder: nothing before its time, nothing of others touched, everything explained."""
+"""The run folder: nothing is written too early, other files stay, every file is explained."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is made of a finished reconstruction."""
+"""Mesh and scores of a finished reconstruction."""
 
 from __future__ import annotations
 

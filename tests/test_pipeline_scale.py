@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which scale a run has: known sizes, ground truth, and what the report says of it."""
+"""The scale of a run: known sizes, ground truth, and what the report says about it."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_the_floor_of_a_map_of_another_size_is_as_far_away() -> None:
 # --- baselines and ground truth -----------------------------------------------------------
 
 
-def test_a_baseline_tells_the_scale() -> None:
+def test_a_baseline_gives_the_scale() -> None:
     found = from_baseline(walk(scale=0.5), 3.0, None)
     truth = walk().T_world_camera[:, :3, 3]
     assert np.linalg.norm(truth[-1] - truth[0]) == pytest.approx(3.0, abs=1e-6)
@@ -170,21 +170,21 @@ def test_a_baseline_tells_the_scale() -> None:
     assert between.factor == pytest.approx(1.0 / np.linalg.norm(b - a), rel=1e-9)
 
 
-def test_baselines_that_tell_nothing() -> None:
+def test_baselines_that_give_no_scale() -> None:
     loop = walk()
     there_and_back = Trajectory(
         np.linspace(0, 6, 120), np.concatenate([loop.T_world_camera, loop.T_world_camera[::-1]])
     )
-    with pytest.raises(DatasetError, match="too close to tell a scale"):
+    with pytest.raises(DatasetError, match="too close to give a scale"):
         from_baseline(there_and_back, 1.0, None)
-    with pytest.raises(DatasetError, match=r"no frame was placed within 0.5 s of 9\.000 s"):
+    with pytest.raises(DatasetError, match=r"no frame was tracked within 0.5 s of 9\.000 s"):
         from_baseline(loop, 1.0, (0.0, 9.0))
     holes = Trajectory(loop.timestamps_s[[0, 1, 58, 59]], loop.T_world_camera[[0, 1, 58, 59]])
     with pytest.raises(DatasetError, match=r"of 3\.000 s"):
         from_baseline(holes, 1.0, (0.0, 3.0))
 
 
-def test_the_ground_truth_tells_the_scale() -> None:
+def test_the_ground_truth_gives_the_scale() -> None:
     found = from_ground_truth(walk(), replace(walk(), T_world_camera=scaled(walk(), 0.8)))
     assert found.factor == pytest.approx(1 / 0.8, rel=1e-6)
     assert found.sigma_log < 1e-6
@@ -226,7 +226,7 @@ def test_estimates_are_fused_by_inverse_variance_of_the_log() -> None:
     assert fused([b, b])[:2] == pytest.approx((2.0, 0.1 / math.sqrt(2)))
 
 
-def test_without_anything_known_the_network_is_believed_and_doubted() -> None:
+def test_without_a_known_size_the_scale_is_the_networks_with_its_uncertainty() -> None:
     made, facts, notes = settled(reconstruction_of())
     assert (facts.source, facts.factor, facts.from_ground_truth) == (ScaleSource.NETWORK, 1.0, False)
     assert facts.uncertainty_log == pytest.approx(math.hypot(NETWORK_SIGMA_LOG, np.std(VOTES) / math.sqrt(5)))
@@ -292,9 +292,8 @@ def test_a_number_multiplies_and_claims_nothing() -> None:
 
 def test_what_cannot_be_right_is_refused_before_the_run() -> None:
     dataset = MadeUpDataset(5)
-    sensor = Config.from_dict({"depth": {"name": "sensor"}, "scale": {"depth": 2.0}})
     with pytest.raises(ConfigError, match="in metres already"):
-        check_scale_options(dataset, sensor, range(5))
+        choose_prediction_scale(dataset, SensorDepth(), config_of(depth=2.0), range(5))
     times = config_of(baseline_m=1.0, baseline_between_s=(0.1, 7.0))
     with pytest.raises(
         ConfigError, match=r"--baseline-between 7\.000: the frames run from 0\.000 to 0\.400 s"

@@ -38,7 +38,7 @@ def run_command(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Depth model, or 'sensor'; an unknown name lists those there are. Default: dinov2",
+            help="Depth model, or 'sensor'; an unknown name lists all names. Default: dinov2",
         ),
     ] = None,
     depth_weights: DepthWeightsOption = None,
@@ -46,8 +46,8 @@ def run_command(
         str | None,
         typer.Option(
             metavar="FILE|X|groundtruth",
-            help="Multiply predicted depth: by a file of 'slamdepth scale', by a number, or by what this "
-            "sequence's ground truth says.",
+            help="Multiply predicted depth: by a file of 'slamdepth scale', by a number, or by a "
+            "factor from this sequence's ground truth.",
         ),
     ] = None,
     camera_height: Annotated[
@@ -55,7 +55,10 @@ def run_command(
     ] = None,
     baseline_m: Annotated[
         float | None,
-        typer.Option(metavar="M", help="Distance in metres from the first camera to the last, or see next."),
+        typer.Option(
+            metavar="M",
+            help="Distance in metres from the first camera to the last; or see --baseline-between.",
+        ),
     ] = None,
     baseline_between: Annotated[
         tuple[float, float] | None,
@@ -84,7 +87,7 @@ def run_command(
         typer.Option(
             metavar="MS",
             help="Milliseconds the camera takes from an image's first row to its last (rolling shutter); "
-            "0 for a global shutter. Default: found out from the motion",
+            "0 for a global shutter. Default: estimated from the motion",
         ),
     ] = None,
     config: Annotated[
@@ -114,7 +117,7 @@ def run_command(
 
     Example: slamdepth run rgbd_dataset_freiburg1_rpy --depth sensor --features sift
 
-    Ctrl-C finishes the run with the frames it has; a second Ctrl-C breaks it off.
+    Ctrl-C finishes the run with the frames it has; a second Ctrl-C aborts it.
     """
     settings = _settings(
         config,
@@ -138,16 +141,26 @@ def run_command(
             "map": {"voxel_size_m": voxel_size},
         },
     )
-    from slamdepth.pipeline import RunOptions, run
+    from slamdepth.pipeline import run
 
-    options = RunOptions(sequence, output, camera, max_frames, stride, not no_mesh, overwrite)
     with stop_on_signals() as stop, JobBar(quiet) as bar:
-        result = run(options, settings, progress=lambda step: _show(bar, step), stop=stop)
+        result = run(
+            sequence,
+            output,
+            camera=camera,
+            config=settings,
+            max_frames=max_frames,
+            stride=stride,
+            mesh=not no_mesh,
+            overwrite=overwrite,
+            progress=lambda step: _show(bar, step),
+            stop=stop,
+        )
     _print_result(result, quiet)
 
 
 def _settings(path: Path | None, asked: dict[str, Any]) -> Config:
-    """Command line over YAML file over defaults; what is None was not asked for."""
+    """Settings of the command line over those of the YAML file over defaults; None means not given."""
     from slamdepth.config import Config
 
     overrides: dict[str, Any] = {}

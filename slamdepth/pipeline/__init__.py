@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from slamdepth.pipeline.options import RunInterrupted, RunOptions, RunProgress, RunResult, Stage
+from slamdepth.pipeline.options import RunInterrupted, RunOptions, RunProgress, RunResult, RunStage
 from slamdepth.pipeline.run import run
 
-__all__ = ["RunInterrupted", "RunOptions", "RunProgress", "RunResult", "Stage", "run"]
+__all__ = ["RunInterrupted", "RunOptions", "RunProgress", "RunResult", "RunStage", "run"]

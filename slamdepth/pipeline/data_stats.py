@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Data sets with depth side by side: how much there is, how far, how sparse, through which lens."""
+"""Data sets with depth side by side: number of images, ranges, sparsity, lens."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from slamdepth import __version__
-from slamdepth.errors import ConfigError, DatasetError, OutputError, SlamdepthError
+from slamdepth.errors import DatasetError, SlamdepthError
 from slamdepth.evaluation.depth_statistics import DepthStatistics
-from slamdepth.io import writable, write_json
+from slamdepth.io import write_json
 from slamdepth.pipeline.depth_data import open_depth_data, thinned
+from slamdepth.pipeline.folder import make_folder, writable_folder
+from slamdepth.pipeline.options import check_frames_asked
 from slamdepth.report.data_stats import DataRow, write_data_page
 from slamdepth.training.data import Place
 from slamdepth.types import Camera
@@ -27,7 +30,7 @@ Progress = Callable[[str, int, int], None]
 
 
 class StatisticsInterrupted(SlamdepthError):
-    """Stopped before all images were counted; half a count would mislead, so none is given."""
+    """Stopped before all images were counted. No result is given, for a partial count would mislead."""
 
     exit_code = 130
 
@@ -41,65 +44,86 @@ def data_statistics(
     progress: Progress | None = None,
     stop: threading.Event | None = None,
 ) -> dict[str, Any]:
-    """Count the depth of data sets; where ``output`` is named, also write page, picture and JSON there.
+    """Count the depth of data sets; where ``output`` is given, also write page, histograms and JSON there.
 
     Args:
         data: folders, see :func:`slamdepth.pipeline.depth_data.open_depth_data`.
-        stride, max_frames: of each data set every so-manieth image, no more than so many.
-        progress: called after each image.
+        output: folder for the results.
+        stride, max_frames: every Nth image of each data set, and at most this many.
+        progress: called after each image with the data set's name, images done, images in all.
         stop: set it, from any thread or a signal handler, to stop.
 
     Returns:
         The content of ``data-stats.json``.
 
     Raises:
-        InputError: a folder, a setting or the output place is wrong.
+        InputError: a folder, a setting or the output folder is wrong.
         StatisticsInterrupted: ``stop`` was set.
     """
-    if stride < 1 or (max_frames is not None and max_frames < 1):
-        raise ConfigError(f"stride and number of frames must be 1 or more, got {stride} and {max_frames}")
+    check_frames_asked(stride, max_frames)
     if output is not None:
-        output = output.expanduser()
-        if output.exists() and not output.is_dir():
-            raise OutputError(f"{output}: is a file; name a folder for the results")
-        writable(output)
+        output = writable_folder(output)
     found = [(path, place) for path in data for place in open_depth_data(path)]
     chosen = [thinned(place, stride, max_frames) for _, place in found]
-    total, done = sum(map(len, chosen)), 0
-    rows: list[DataRow] = []
-    for (_, place), name, indices in zip(found, _names(found), chosen, strict=True):
-        statistics, notes, troubles = DepthStatistics(), list(place.notes), []
+    counter = _Counter(sum(map(len, chosen)), progress or (lambda *_: None), stop or threading.Event())
+    rows = [
+        counter.count(name, place, indices)
+        for (_, place), name, indices in zip(found, _names(found), chosen, strict=True)
+    ]
+    about = _about(rows, stride, max_frames)
+    if output is not None:
+        make_folder(output)
+        write_json(output / "data-stats.json", about)
+        write_data_page(output, rows, about)
+    return about
+
+
+@dataclass
+class _Counter:
+    """Counts images of all data sets.
+
+    Attributes:
+        total: images of all of them.
+        done: images that were looked at.
+    """
+
+    total: int
+    progress: Progress
+    stop: threading.Event
+    done: int = 0
+
+    def count(self, name: str, place: Place, indices: Sequence[int]) -> DataRow:
+        """Statistics of one data set; images that cannot be read are left out.
+
+        Raises:
+            DatasetError: no image can be read.
+            StatisticsInterrupted: ``stop`` was set.
+        """
+        statistics = DepthStatistics()
+        failures: list[str] = []
         for index in indices:
-            if stop is not None and stop.is_set():
-                raise StatisticsInterrupted(f"interrupted after {done} of {total} images; nothing is written")
+            if self.stop.is_set():
+                raise StatisticsInterrupted(
+                    f"interrupted after {self.done} of {self.total} images; nothing is written"
+                )
             try:
                 depth_m = place.read(index).depth_m
                 assert depth_m is not None  # a place has depth or says which file is wrong
                 statistics.add(depth_m)
             except DatasetError as error:
                 logger.warning("left out: %s", error)
-                troubles.append(str(error))
-            done += 1
-            if progress is not None:
-                progress(name, done, total)
+                failures.append(str(error))
+            self.done += 1
+            self.progress(name, self.done, self.total)
         if not statistics.images:
-            why = troubles[0] if troubles else "none of the images looked at has one"
+            why = failures[0] if failures else "none of the images looked at has one"
             raise DatasetError(f"{name}: no depth image could be read: {why}")
-        notes += [f"{len(troubles)} images cannot be read and are left out"] if troubles else []
-        rows.append(DataRow(name, place.camera, len(place), statistics, tuple(notes)))
-    about = _about(rows, stride, max_frames)
-    if output is not None:
-        try:
-            output.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{output}: cannot be written: {error.strerror or error}") from error
-        write_json(output / "data-stats.json", about)
-        write_data_page(output, rows, about)
-    return about
+        left_out = [f"{len(failures)} images cannot be read and are left out"] if failures else []
+        return DataRow(name, place.camera, len(place), statistics, (*place.notes, *left_out))
 
 
 def view_deg(camera: Camera) -> float:
-    """Horizontal field of view in degrees, lens distortion left aside."""
+    """Horizontal field of view in degrees, without regard to lens distortion."""
     return math.degrees(
         math.atan((camera.cx + 0.5) / camera.fx) + math.atan((camera.width - 0.5 - camera.cx) / camera.fx)
     )
@@ -134,7 +158,7 @@ def _about(rows: list[DataRow], stride: int, max_frames: int | None) -> dict[str
 
 
 def _names(found: list[tuple[Path, Place]]) -> list[str]:
-    """Names of the data sets, those of one name with the name of the folder above."""
+    """Names of the data sets; those that share a name get that of the parent folder before it."""
     names = [place.name for _, place in found]
     return [
         f"{path.resolve().parent.name}/{place.name}" if names.count(place.name) > 1 else place.name

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images with sensor depth to judge by or to count, however they are stored."""
+"""Images with sensor depth, however they are stored."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slamdepth.datasets import open_dataset
+from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.errors import DatasetError
 from slamdepth.pipeline.training_data import SequencePlace, sequence_readers
 from slamdepth.training.data import Place, data_folder, known_readers, open_place
@@ -21,8 +21,10 @@ _SEQUENCE_STRIDE = 10
 
 
 def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
-    """What a folder holds: training pairs (``camera.json``), a Hypersim scene or a sequence of a known
-    layout, or several of those, each in a folder of its own.
+    """Open a folder of images with depth.
+
+    It holds training pairs (``camera.json``), a Hypersim scene or a sequence of a known layout, or several of
+    these in folders of their own.
 
     Args:
         path: absolute, relative to the current folder, or below ``$SLAMDEPTH_DATA``.
@@ -33,28 +35,45 @@ def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
             no depth.
         CameraError: the intrinsics of a sequence are unknown or malformed.
     """
-    try:
-        if path.is_file():
-            raise DatasetError(f"{path}: is a file; name a folder of images with depth")
-        folder = data_folder(str(path))
-        is_one, is_sequence = _is_place(folder), _is_sequence(folder)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
-    places = [folder] if is_one else [] if is_sequence else _inside(folder, _is_place)
+    places, sequences = _contents(path)
     if places and camera is not None:
         raise DatasetError(f"{places[0]}: its camera is known with it; leave out --camera")
     if places:
         return [open_place(place) for place in places]
-    sequences = [folder] if is_sequence else _inside(folder, _is_sequence)
     if not sequences:
         layouts = {**known_readers(), **sequence_readers()}
         known = "; ".join(f"{name} ({reader.needs})" for name, reader in layouts.items() if name != "video")
         raise DatasetError(
             f"{path}: no known sequence layout and no other images with depth; known are: {known}"
         )
-    datasets = [open_dataset(sequence, camera) for sequence in sequences]
-    if not (with_depth := [dataset for dataset in datasets if dataset.has_depth]):
-        return [SequencePlace.of(datasets[0])]  # which says so
+    return _with_depth([open_dataset(sequence, camera) for sequence in sequences])
+
+
+def _contents(path: Path) -> tuple[list[Path], list[Path]]:
+    """Folders of pairs or scenes in ``path`` (or ``path`` itself), or, where there are none, of sequences."""
+    try:
+        if path.is_file():
+            raise DatasetError(f"{path}: is a file; name a folder of images with depth")
+        folder = data_folder(str(path))
+        if _is_place(folder):
+            return [folder], []
+        if _is_sequence(folder):
+            return [], [folder]
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+    places = _inside(folder, _is_place)
+    return places, [] if places else _inside(folder, _is_sequence)
+
+
+def _with_depth(datasets: list[Dataset]) -> list[Place]:
+    """Those that have sensor depth; the others are left out with a warning.
+
+    Raises:
+        DatasetError: none of them has any.
+    """
+    with_depth = [dataset for dataset in datasets if dataset.has_depth]
+    if not with_depth:
+        return [SequencePlace.of(datasets[0])]  # raises, and names it
     for dataset in datasets:
         if not dataset.has_depth:
             logger.warning("%s: left out, has no sensor depth", dataset.path)
@@ -70,7 +89,7 @@ def _is_sequence(folder: Path) -> bool:
 
 
 def _inside(folder: Path, is_wanted: Callable[[Path], bool]) -> list[Path]:
-    """The folders in it that are wanted; one that cannot be looked into is left out with a warning."""
+    """The subfolders that are wanted; one that cannot be read is left out with a warning."""
     found = []
     for below in sorted(folder.glob("*")):
         try:
@@ -85,9 +104,9 @@ def thinned(place: Place, stride: int | None = None, max_frames: int | None = No
     """Which images of ``place`` to look at.
 
     Args:
-        stride: every so-manieth image, of a sequence counted with those that lack depth;
-            None: 10 of a sequence, 1 of others, which are thinned already.
-        max_frames: no more than so many, spread evenly over those.
+        stride: every Nth image; in a sequence, images without depth count too. Default: 10 for sequences,
+            1 for others, which are thinned already.
+        max_frames: at most this many, spread evenly.
     """
     numbers: Iterable[int] = range(len(place))
     if isinstance(place, SequencePlace):

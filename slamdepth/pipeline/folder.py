@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run folder: where it lies, what is in it, and its log."""
+"""The run folder: its place, its files and its log."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from slamdepth.io import writable, write_text
 
 FILES = {
     "trajectory.txt": "every placed frame after optimisation (TUM format, camera to world)",
-    "trajectory_online.txt": "each frame's pose as it was first placed, written while the run went on",
+    "trajectory_online.txt": "each frame's pose as it was first placed, written during the run",
     "keyframes.txt": "the keyframes of trajectory.txt",
     "depth_scale.yaml": "the scale fitted to the sequence's own sensor (--depth-scale groundtruth)",
     "mesh.ply": "coloured mesh of the scene in the frame of the first camera, metres",
     "mesh.png": "the mesh as a whole with the camera's path, and over the camera's shoulder",
     "report.html": "figures and plots of the run; opens in any browser, needs nothing else",
     "report.json": "the same figures for programs",
-    "config.yaml": "the settings used, for --config; which images and which camera are not among them",
+    "config.yaml": "the settings used, for --config; images and camera are not among them",
     "log.txt": "what happened, in detail",
     "README.txt": "this list, and the command for the same run again",
 }
@@ -36,14 +36,19 @@ _MARK = "A run of slamdepth"
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A place for the results of one run; nothing is made before :meth:`create`."""
+    """The folder of one run's results. Nothing is written before :meth:`create`.
+
+    Attributes:
+        path: the folder.
+        replaces: True where it holds an earlier run, whose files are to be removed.
+    """
 
     path: Path
     replaces: bool = False
 
     @classmethod
     def plan(cls, output: Path | None, sequence_name: str, *, overwrite: bool) -> RunFolder:
-        """Choose and check the place.
+        """Choose and check the folder.
 
         Raises:
             OutputError: it is a file, holds something already, or cannot be written.
@@ -71,22 +76,20 @@ class RunFolder:
         return cls(writable(path), replaces=True)
 
     def create(self, arguments: Sequence[str] = ()) -> None:
-        """Make the folder, empty of the files of an earlier run, and its README.
+        """Make the folder, without the files of an earlier run, and its README.
 
         Args:
-            arguments: of 'slamdepth run', as the user gave them, what ``config.yaml`` does not hold:
-                the README tells the command for the same run again.
+            arguments: of ``slamdepth run``, those that ``config.yaml`` does not hold; the README gives the
+                command for the same run again.
 
         Raises:
             OutputError: it cannot be written.
         """
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            if self.replaces:
+        make_folder(self.path)
+        if self.replaces:
+            with writing(self.path):
                 for name in FILES:
                     (self.path / name).unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
         width = max(map(len, FILES))
         lines = [f"{name:<{width}}  {what}" for name, what in FILES.items()]
         head = f"{_MARK}. A file that is missing was not asked for, or the run was killed before it.\n\n"
@@ -133,10 +136,8 @@ def write_log_to(buffer: logging.handlers.MemoryHandler, path: Path) -> None:
     Raises:
         OutputError: ``path`` cannot be written.
     """
-    try:
+    with writing(path):
         file = logging.FileHandler(path, mode="w", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
     buffer.setTarget(file)
     buffer.flush()
@@ -148,3 +149,38 @@ def _is_run(path: Path) -> bool:
         return (path / _README).read_text(encoding="utf-8").startswith(_MARK)
     except (OSError, UnicodeDecodeError):
         return False
+
+
+def writable_folder(path: Path) -> Path:
+    """``path``, if it is a folder that can be written or can become one.
+
+    Raises:
+        OutputError: it is a file or cannot be written.
+    """
+    path = path.expanduser()
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path}: is a file; name a folder for the results")
+    return writable(path)
+
+
+def make_folder(path: Path) -> None:
+    """Make the folder ``path`` and those above it, where they are missing.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn what the system says against writing to ``path`` into one clear error.
+
+    Raises:
+        OutputError: the block raised an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lengths that are known against lengths of the map: where a finished map's scale comes from."""
+"""The scale of a finished map from known lengths, a sensor or a ground truth trajectory."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from slamdepth.types import Frame, Trajectory
 from slamdepth.typing import Floats
 
 HEIGHT_SIGMA_LOG = 0.03
-"""How well a camera's height over a floor is known to people, and a floor is level."""
+"""Standard deviation of the log of a camera height: how well it is measured, and how level a floor is."""
 PREDICTED_HEIGHT_SIGMA_LOG = 0.12
-"""How far a floor of predicted depth lies from the map's own scale: a network errs on floors as a
-whole, which keyframes don't average out. With an earlier head it was 14 % in the rendered room."""
+"""Standard deviation of the log of a camera height over a floor of predicted depth: the error of a network on
+floors is common to all keyframes. With an earlier head it was 14 % in the rendered room."""
 LENGTH_SIGMA_LOG = 0.01
-"""How well people measure a distance."""
+"""Standard deviation of the log of a distance that people measured."""
 SENSOR_SIGMA_LOG = 0.03
-"""Of a Kinect's depth: the factors in use for one camera of TUM RGB-D differ by 4 %."""
+"""Standard deviation of the log of a Kinect's depth: factors in use for one camera of TUM RGB-D differ by
+4 %."""
 DRIFT = 0.01
-"""Share of the path by which the distance of two places on it may be wrong."""
+"""Standard deviation of the distance of two positions, as a share of the path between them."""
 _MAX_GAP_S = 0.5
 _MAX_SIGMA_LOG = 0.3
 _FEWEST_POINTS = 20
@@ -38,9 +39,10 @@ _FEWEST_POINTS = 20
 
 @dataclass(frozen=True)
 class ScaleEstimate:
-    """What the lengths of a map should be multiplied by, and how sure that is.
+    """What the lengths of a map should be multiplied by, with its uncertainty.
 
     Attributes:
+        source: where it comes from.
         factor: on the map's lengths.
         sigma_log: standard deviation of the natural log of ``factor``.
         how: what was compared, as a phrase.
@@ -53,9 +55,9 @@ class ScaleEstimate:
 
 
 def rescaled(reconstruction: Reconstruction, factor: float) -> Reconstruction:
-    """The same reconstruction with every length multiplied by ``factor``.
+    """The reconstruction with every length multiplied by ``factor``.
 
-    Predictions and sensor depth stay as they were given; what the map makes of them changes.
+    Predictions and sensor depth stay as they are; only their scale in the map changes.
     """
     return replace(
         reconstruction,
@@ -72,7 +74,7 @@ def rescaled(reconstruction: Reconstruction, factor: float) -> Reconstruction:
 
 
 def _moved(T: Floats, factor: float) -> Floats:
-    out = T.copy()
+    out: Floats = T.copy()
     out[..., :3, 3] *= factor
     return out
 
@@ -95,8 +97,10 @@ def from_camera_height(
     """Compare the first camera's known height with that over the floor of the map.
 
     Args:
-        max_depth_m: depth beyond is not used.
-        gravity_w: direction of gravity ``(3,)`` in the world, where it is known.
+        keyframes: of the finished map.
+        height_m: the known height in metres.
+        max_depth_m: depth beyond it is not used.
+        gravity_w: ``(3,)`` unit direction of gravity in the world, where it is known.
 
     Raises:
         DatasetError: no floor is found.
@@ -105,7 +109,9 @@ def from_camera_height(
     if floor is None:
         held = f", the first camera upright to within {MAX_TILT_DEG:g} degrees" if gravity_w is None else ""
         raise DatasetError(f"no floor was found below the first camera (a large level surface{held})")
-    level = "the first camera's y axis" if gravity_w is None else "level, by gravity as the images tell it"
+    level = (
+        "the first camera's y axis" if gravity_w is None else "level, by gravity as estimated from the images"
+    )
     how = (
         f"a camera height of {height_m:g} m against {floor.height:.2f} m over the lowest large level "
         f"surface, which {floor.keyframes} keyframes see, {floor.tilt_deg:.0f} degrees from {level}"
@@ -118,11 +124,12 @@ def from_camera_height(
 def from_sensor(keyframes: Sequence[Keyframe], frames: Iterable[Frame]) -> ScaleEstimate:
     """Compare the sensor's depth with the map's at the keypoints of every keyframe.
 
-    What predictions are multiplied by is fitted to all pixels; the map is made of those that can be tracked,
-    where a network errs in another way.
+    The scale of predictions is fitted to all pixels. The map is made of those that can be tracked, where the
+    error of a network differs.
 
     Args:
-        frames: those of the keyframes, with their sensor depth; some may be missing.
+        keyframes: of the finished map.
+        frames: the frames of the keyframes, with sensor depth; some may be missing.
 
     Raises:
         DatasetError: no keyframe has both.
@@ -150,46 +157,48 @@ def from_sensor(keyframes: Sequence[Keyframe], frames: Iterable[Frame]) -> Scale
 def from_baseline(
     trajectory: Trajectory, length_m: float, between_s: tuple[float, float] | None
 ) -> ScaleEstimate:
-    """Compare a known distance of two places of the camera with that in the map.
+    """Compare a known distance between two positions of the camera with that in the map.
 
     Args:
-        between_s: the two times; None takes the first and the last pose.
+        trajectory: of the finished map.
+        length_m: the known distance in metres.
+        between_s: the two times in seconds; None takes the first and the last pose.
 
     Raises:
-        DatasetError: there is no pose near one of the times, or the two places are too close
-            together, measured by the path between them, to tell a scale.
+        DatasetError: there is no pose near one of the times, or the two positions are too close together,
+            in relation to the path between them, to give a scale.
     """
-    times_s, places = trajectory.timestamps_s, trajectory.T_world_camera[:, :3, 3]
+    times_s, positions = trajectory.timestamps_s, trajectory.T_world_camera[:, :3, 3]
     first_s, last_s = (float(times_s[0]), float(times_s[-1])) if between_s is None else between_s
-    a, b = (_place_at(times_s, places, t) for t in (first_s, last_s))
+    a, b = (_position_at(times_s, positions, t) for t in (first_s, last_s))
     distance = float(np.linalg.norm(b - a))
     inside = (times_s > first_s) & (times_s < last_s)
-    path = np.vstack([a, places[inside], b])
+    path = np.vstack([a, positions[inside], b])
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     sigma_log = math.hypot(LENGTH_SIGMA_LOG, DRIFT * length / distance) if distance > 0 else math.inf
     if not sigma_log <= _MAX_SIGMA_LOG:
         raise DatasetError(
-            f"the camera's places at {first_s:.3f} and {last_s:.3f} s are {distance:.3f} m apart after "
-            f"{length:.2f} m of path: too close to tell a scale; name two other times (--baseline-between)"
+            f"the camera's positions at {first_s:.3f} and {last_s:.3f} s are {distance:.3f} m apart after "
+            f"{length:.2f} m of path: too close to give a scale; name two other times (--baseline-between)"
         )
     how = f"a baseline of {length_m:g} m against {distance:.3f} m between {first_s:.3f} and {last_s:.3f} s"
     return ScaleEstimate(ScaleSource.BASELINE, length_m / distance, sigma_log, how)
 
 
-def _place_at(times_s: Floats, places: Floats, time_s: float) -> Floats:
-    """Position ``(3,)`` at a time, between the poses around it."""
+def _position_at(times_s: Floats, positions: Floats, time_s: float) -> Floats:
+    """Position ``(3,)`` at a time, interpolated between the poses around it."""
     after = int(np.clip(np.searchsorted(times_s, time_s), 0, len(times_s) - 1))
     before = after if times_s[after] <= time_s or after == 0 else after - 1
     gap_s = max(abs(float(times_s[i]) - time_s) for i in (before, after))
     if gap_s > _MAX_GAP_S:
-        raise DatasetError(f"no frame was placed within {_MAX_GAP_S:g} s of {time_s:.3f} s")
+        raise DatasetError(f"no frame was tracked within {_MAX_GAP_S:g} s of {time_s:.3f} s")
     return np.array(
-        [np.interp(time_s, times_s[[before, after]], places[[before, after], i]) for i in range(3)]
+        [np.interp(time_s, times_s[[before, after]], positions[[before, after], i]) for i in range(3)]
     )
 
 
 def from_ground_truth(ground_truth: Trajectory, estimate: Trajectory) -> ScaleEstimate:
-    """The scale of the Sim(3) alignment of the estimate with its ground truth.
+    """The scale of the Sim(3) alignment of ``estimate`` with ``ground_truth``.
 
     Raises:
         DatasetError: the two cannot be aligned.

@@ -1,30 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run is asked for beside its settings, and what it tells while it goes on."""
+"""What a run is asked for in addition to its settings, what it reports while it works, what it returns."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from slamdepth.errors import ConfigError, SlamdepthError
-from slamdepth.types import TrackingStatus
+from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.types import TrackingStatus, Trajectory
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """One run, beside its :class:`slamdepth.config.Config`.
+    """One run, in addition to its :class:`slamdepth.config.Config`.
 
     Attributes:
-        sequence: folder of the sequence.
+        sequence: a video or the folder of a sequence.
         output: run folder; None makes ``runs/<sequence>-<time>``.
         camera_file: a ``camera.yaml`` that overrules what the sequence says.
-        max_frames: stop after so many frames; None reads all.
-        stride: take every so-manieth frame.
+        max_frames: stop after this many frames; None reads all.
+        stride: take every Nth frame.
         mesh: fuse the keyframes and write ``mesh.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
+
+    Raises:
+        ConfigError: ``stride`` or ``max_frames`` is below 1.
     """
 
     sequence: Path
@@ -36,10 +40,7 @@ class RunOptions:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise ConfigError(f"the stride must be 1 or more, got {self.stride}")
-        if self.max_frames is not None and self.max_frames < 1:
-            raise ConfigError(f"the number of frames must be 1 or more, got {self.max_frames}")
+        check_frames_asked(self.stride, self.max_frames)
 
     def indices(self, frames: int) -> range:
         """Which of ``frames`` frames are read, in order."""
@@ -47,7 +48,19 @@ class RunOptions:
         return chosen if self.max_frames is None else chosen[: self.max_frames]
 
 
-class Stage(str, Enum):
+def check_frames_asked(stride: int, max_frames: int | None) -> None:
+    """Refuse a stride or a number of frames below 1.
+
+    Raises:
+        ConfigError: one of them is.
+    """
+    if stride < 1:
+        raise ConfigError(f"the stride must be 1 or more, got {stride}")
+    if max_frames is not None and max_frames < 1:
+        raise ConfigError(f"the number of frames must be 1 or more, got {max_frames}")
+
+
+class RunStage(str, Enum):
     """What a run is doing."""
 
     SCALING = "fitting the scale"
@@ -59,15 +72,17 @@ class Stage(str, Enum):
 
 @dataclass(frozen=True)
 class RunProgress:
-    """State of a run, told after each frame and at each new stage.
+    """State of a run, reported after each frame and at the start of each stage.
 
     Attributes:
+        stage: what the run is doing.
         done, total: frames while tracking and fitting, keyframes while meshing.
         fps: frames per second so far.
         status: of the last frame, None before the first.
+        keyframes, loop_closures: totals so far.
     """
 
-    stage: Stage
+    stage: RunStage
     done: int = 0
     total: int = 0
     fps: float = 0.0
@@ -84,14 +99,22 @@ class RunResult:
     """What a run left behind.
 
     Attributes:
-        folder: the run folder.
-        summary: the content of ``report.json``.
-        interrupted: True where it was stopped before the last frame.
+        folder: the run folder; its ``README.txt`` explains each file.
+        summary: the content of ``report.json``: counts, scores, versions, settings.
+        reconstruction: trajectory, keyframes and map points at their final scale, as they were written.
+            Images and depth of the keyframes stay in memory or in a temporary file as long as it is kept.
+        interrupted: True where the run was stopped before the last frame.
     """
 
     folder: Path
     summary: dict[str, Any]
-    interrupted: bool
+    reconstruction: Reconstruction = field(repr=False)
+    interrupted: bool = False
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Every placed frame after optimisation, as in ``trajectory.txt``."""
+        return self.reconstruction.trajectory
 
 
 class RunInterrupted(SlamdepthError):

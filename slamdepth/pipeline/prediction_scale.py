@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chosen before tracking: what predictions are multiplied (and shifted) by as they come.
+"""Before tracking: the factor (and shift) that is applied to every prediction.
 
-A number, a file of ``slamdepth scale``, or what this sequence's own sensor says.
+It is a number, comes from a file of ``slamdepth scale``, or is fitted to this sequence's own sensor.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from slamdepth.config import GROUND_TRUTH, Config
 from slamdepth.datasets import Dataset
-from slamdepth.depth.base import DepthModel
+from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.scale import DepthScale, ScaleDomain, ScaleFit, fit_scale, needs_shift
 from slamdepth.depth.scale_file import check_same_model, read_scale
 from slamdepth.depth.scaled import ScaledDepth
@@ -29,12 +29,13 @@ from slamdepth.types import Frame
 logger = logging.getLogger(__name__)
 
 NETWORK_SIGMA_LOG = 0.2
-"""Assumed deviation of a network's scale that all frames of a place share: the shipped head was off
-by 0.10 to 0.17 on three real sequences it had not seen (README), by more on some places held out."""
+"""Assumed standard deviation of the log of a network's scale, common to all frames of a place. The shipped
+head was off by 0.10 to 0.17 on three real sequences it had not seen (README), by more on some held-out
+places."""
 
 MAP_SIGMA_LOG = 0.12
-"""Assumed deviation of a map's scale from that of all pixels of its predictions: points lie where there is
-texture. On fr1_rpy and fr1_desk the two differ by a tenth."""
+"""Assumed standard deviation of the log ratio of a map's scale and that of all pixels of its predictions:
+points lie where there is texture. On fr1_rpy and fr1_desk the two differ by a tenth."""
 
 _FIT_FRAMES = 60
 
@@ -44,13 +45,13 @@ class PredictionScale:
     """What was decided before tracking.
 
     Attributes:
-        source: NETWORK or SENSOR where predictions stay as they are.
-        scale: what predictions are made metric by, or None.
-        sigma_log: assumed deviation of the log of the resulting scale of the map.
-        how: a phrase.
-        from_ground_truth: the scale comes from this sequence's own sensor.
-        fit: where this run fitted it.
-        wants_trajectory: the scale is to be taken from the ground truth's trajectory afterwards.
+        source: where the scale comes from; NETWORK or SENSOR where predictions stay as they are.
+        how: the same as a phrase.
+        sigma_log: assumed standard deviation of the log of the resulting scale of the map.
+        scale: what is applied to predictions, or None.
+        from_ground_truth: True where the scale comes from this sequence's own sensor.
+        fit: the fit, where this run made one.
+        wants_trajectory: True where the scale is to be taken from the ground truth's trajectory afterwards.
     """
 
     source: ScaleSource
@@ -61,8 +62,13 @@ class PredictionScale:
     fit: ScaleFit | None = None
     wants_trajectory: bool = False
 
+    @property
+    def prediction_factor(self) -> float:
+        """What predictions are multiplied by as they come."""
+        return 1.0 if self.scale is None else self.scale.scale
+
     def applied_to(self, model: DepthModel) -> DepthModel:
-        """``model``, its predictions scaled where that was decided.
+        """``model``, with its predictions scaled where that was decided.
 
         Raises:
             ConfigError: this scale cannot make this model metric.
@@ -74,12 +80,10 @@ def check_scale_options(dataset: Dataset, config: Config, indices: Sequence[int]
     """Refuse what cannot be right, before anything is computed.
 
     Raises:
-        ConfigError: a scale for sensor depth, or times of a baseline outside the frames.
+        ConfigError: the times of a baseline lie outside the frames.
         DatasetError: there is no ground truth to take a scale from.
     """
     scale = config.scale
-    if scale.depth is not None and config.depth.name == "sensor":
-        raise ConfigError("--depth sensor is in metres already; --depth-scale is for predicted depth")
     if scale.depth == GROUND_TRUTH and not dataset.has_depth and dataset.ground_truth is None:
         raise DatasetError(
             f"{dataset.path}: has neither depth images nor a ground truth trajectory to take the scale from"
@@ -102,22 +106,26 @@ def choose_prediction_scale(
     progress: Callable[[int, int], None] = lambda done, total: None,
     stop: threading.Event | None = None,
 ) -> PredictionScale:
-    """Decide what predictions are multiplied by, and fit it where that is asked for.
+    """Decide what is applied to predictions, and fit it where that is asked for.
 
     Args:
         model: as it came, not scaled.
         indices: frames of the run; a fit takes some of them.
+        progress: called with the frames read so far and in all, while a scale is fitted.
+        stop: set it to give up.
 
     Raises:
-        ConfigError: the file or number cannot scale this model.
+        ConfigError: the file or number cannot scale this model, or its depth is measured.
         DatasetError: no scale can be fitted.
-        RunInterrupted: ``stop`` was set meanwhile.
+        RunInterrupted: ``stop`` was set before the fit was done.
     """
     asked = config.scale.depth
     name = model.name
+    if is_sensor(model):
+        if asked is not None:
+            raise ConfigError(f"--depth {name} is in metres already; --depth-scale is for predicted depth")
+        return PredictionScale(ScaleSource.SENSOR, "measured by the depth sensor", SENSOR_SIGMA_LOG)
     if asked is None:
-        if name == "sensor":
-            return PredictionScale(ScaleSource.SENSOR, "measured by the depth sensor", SENSOR_SIGMA_LOG)
         return PredictionScale(ScaleSource.NETWORK, f"depth predicted by {name}", NETWORK_SIGMA_LOG)
     if asked == GROUND_TRUTH:
         if not dataset.has_depth:
@@ -169,7 +177,10 @@ def read_with_depth(
     progress: Callable[[int, int], None],
     stop: threading.Event | None = None,
 ) -> Iterator[Frame]:
-    """Frames with their sensor depth; what does not decode is left out with a warning.
+    """Frames with their sensor depth; those that do not decode are left out with a warning.
+
+    Args:
+        progress: called with the frames read so far and in all.
 
     Raises:
         RunInterrupted: ``stop`` was set.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames read and prepared ahead in a thread, in order, so that neither waits for tracking."""
+"""Frames read and prepared ahead in a thread, in order, while others are tracked."""
 
 from __future__ import annotations
 
@@ -23,24 +23,27 @@ _POLL_S = 0.1
 
 @dataclass(frozen=True)
 class ReadFrame:
-    """A frame, and what ``prepare`` gave for it."""
+    """A frame, and what ``prepare`` returned for it."""
 
     frame: Frame
     prepared: Any = None
 
 
 class FramePrefetcher:
-    """Iterates over frames of a dataset; a few are read ahead, so memory is bounded.
+    """Iterates over frames of a dataset; a limited number is read ahead.
 
-    Use it as a context manager: leaving it ends the thread.
+    A context manager; leaving it ends the thread.
 
     Args:
         dataset: the sequence.
         indices: which frames, in the order they come out.
-        with_depth: also read the sensor depth; None where a frame has none or it does not
-            decode.
+        with_depth: also read the sensor depth; it is None where a frame has none or it does not decode.
         prepare: called with each frame, in the thread.
         capacity: frames read ahead.
+
+    Attributes:
+        read_s: seconds spent on reading.
+        broken_depth_images: depth images that did not decode.
     """
 
     def __init__(
@@ -92,7 +95,7 @@ class FramePrefetcher:
                 item: ReadFrame | Exception = ReadFrame(
                     frame, None if self._prepare is None else self._prepare(frame)
                 )
-            except Exception as error:  # handed to the thread that iterates, which raises it
+            except Exception as error:  # raised by the thread that iterates
                 item = error
             if not self._put(item):
                 return

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is made of a finished reconstruction: the mesh and the scores."""
+"""Mesh and scores of a finished reconstruction."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.evaluation import DepthScore, DepthScorer, TrajectoryScore, score_trajectory
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.pipeline.options import ProgressCallback, RunProgress, Stage
+from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
 from slamdepth.report import MeshCounts, MeshImage, render_mesh_images
 from slamdepth.types import DepthKind, Trajectory
 
 logger = logging.getLogger(__name__)
 
-_SENSOR_SCALE = 1.25  # times the truth, and its inverse: what no sensor errs by
+_SENSOR_SCALE = 1.25  # a sensor's scale error stays below this factor and its inverse
 
 
 def keyframe_trajectory(reconstruction: Reconstruction) -> Trajectory:
@@ -40,20 +40,20 @@ def write_keyframe_mesh(
     """Fuse the keyframes and write the mesh.
 
     Returns:
-        Its size, or None where there is no surface and no file; pictures of it; and notes.
+        Its size, or None where there is no surface and no file; images of it; and notes.
 
     Raises:
         OutputError: ``path`` cannot be written.
     """
 
-    def tell(done: int, total: int) -> None:
-        progress(RunProgress(Stage.MESHING, done, total))
+    def report(done: int, total: int) -> None:
+        progress(RunProgress(RunStage.MESHING, done, total))
 
     mesh = reconstruction.fuse_mesh(
         config.map.voxel_size_m,
         max_depth_m=config.map.max_depth_m,
         min_component_triangles=config.map.min_component_triangles,
-        progress=tell,
+        progress=report,
     )
     if len(mesh.triangles) == 0:
         return None, (), mesh.notes
@@ -65,7 +65,7 @@ def write_keyframe_mesh(
 def judge_trajectory(
     dataset: Dataset, estimate: Trajectory, *, is_measured: bool = False
 ) -> tuple[TrajectoryScore | None, tuple[str, ...]]:
-    """Score against the ground truth where there is one; trouble becomes a note.
+    """Score against the ground truth where there is one; a failure becomes a note.
 
     Args:
         is_measured: a sensor's depth made the map, so that its scale should be the truth's.
@@ -89,7 +89,7 @@ def judge_trajectory(
 
 
 def score_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore | None:
-    """Compare the keyframes' predicted depth, as the tracker was given it, with the sensor's."""
+    """Compare the keyframes' predicted depth, as the tracker got it, with the sensor's."""
     if not dataset.has_depth:
         return None
     scorer = DepthScorer()
@@ -99,7 +99,7 @@ def score_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore
         try:
             sensor_m = dataset.read(keyframe.frame.index, with_depth=True).depth_m
         except ImageDecodeError as error:
-            logger.debug("keyframe %d is not judged: %s", keyframe.id, error)
+            logger.debug("depth of keyframe %d is not scored: %s", keyframe.id, error)
             continue
         if sensor_m is not None:
             scorer.add(keyframe.prediction.load().values, sensor_m)

@@ -7,13 +7,13 @@ import logging
 import random
 import sys
 import threading
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from logging.handlers import MemoryHandler
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from slamdepth.config import Config
+from slamdepth.config import Config, merge
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.registry import create_depth_model
@@ -21,13 +21,14 @@ from slamdepth.depth.scale_file import write_scale
 from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.frontend.features import feature_weights
 from slamdepth.io import write_text, write_tum_trajectory
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.folder import FILES, RunFolder, run_log, write_log_to
 from slamdepth.pipeline.options import (
     ProgressCallback,
     RunOptions,
     RunProgress,
     RunResult,
-    Stage,
+    RunStage,
 )
 from slamdepth.pipeline.prediction_scale import (
     PredictionScale,
@@ -41,166 +42,229 @@ from slamdepth.pipeline.results import (
     write_keyframe_mesh,
 )
 from slamdepth.pipeline.scale import settle_scale
-from slamdepth.pipeline.tracking import Tracked, track
+from slamdepth.pipeline.tracking import AnyTracker, Tracked, track
 from slamdepth.report import MeshCounts, MeshImage, ReportData, write_mesh_png, write_report
 
 logger = logging.getLogger(__name__)
 
 
 def run(
-    options: RunOptions,
-    config: Config,
+    sequence: str | Path,
+    output: str | Path | None = None,
     *,
+    depth: str | None = None,
+    camera: str | Path | None = None,
+    config: Config | str | Path | None = None,
+    max_frames: int | None = None,
+    stride: int = 1,
+    mesh: bool = True,
+    overwrite: bool = False,
     progress: ProgressCallback | None = None,
     stop: threading.Event | None = None,
 ) -> RunResult:
     """Track a sequence, mesh it, score it, and write everything into a run folder.
 
-    Bad input leaves no folder behind. The random generators of Python, NumPy, OpenCV and,
-    where it is used, torch are seeded from ``config.seed``.
+    It does what ``slamdepth run`` does, without printing. Bad input leaves no folder behind. The random
+    generators of Python, NumPy, OpenCV and, where it is loaded, torch are seeded from ``config.seed``.
 
     Args:
-        options: which sequence, where to.
-        config: every setting.
-        progress: called after each frame and at each new stage.
-        stop: set it, from any thread or a signal handler, to finish early with the frames
-            tracked so far.
+        sequence: a video, a folder of images, or a folder in the layout of TUM RGB-D or 7-Scenes.
+        output: run folder. Default: ``runs/<sequence>-<time>``.
+        depth: name of the depth model, see :func:`slamdepth.create_depth_model`; ``"sensor"`` takes the
+            sequence's own depth. Default: as ``config`` says, which is ``"dinov2"`` unless changed.
+        camera: a ``camera.yaml`` with the intrinsics. Default: as the sequence says.
+        config: every other setting, or a YAML file with settings. Default: ``Config()``.
+        max_frames: stop after this many frames. Default: all.
+        stride: take every Nth frame.
+        mesh: fuse the keyframes and write ``mesh.ply``.
+        overwrite: an earlier run in ``output`` may be replaced.
+        progress: called after each frame and at the start of each stage.
+        stop: set it, from any thread or a signal handler, to finish early with the frames tracked so far.
+
+    Returns:
+        The folder, the figures of the report, and the reconstruction.
 
     Raises:
-        InputError: the sequence, the camera, a setting or the output place is wrong.
+        InputError: the sequence, the camera, a setting or the output folder is wrong.
         WeightsError: weights are missing or damaged.
         TrackingError: no frame could be placed.
         RunInterrupted: ``stop`` was set before the first frame.
     """
+    options = RunOptions(
+        Path(sequence),
+        None if output is None else Path(output),
+        None if camera is None else Path(camera),
+        max_frames,
+        stride,
+        mesh,
+        overwrite,
+    )
+    settings = _settings(config, depth)
     tell = progress or (lambda state: None)
     stopped = stop or threading.Event()
     with run_log() as log:
-        dataset = open_dataset(options.sequence, options.camera_file)
-        wants_sensor = config.depth.name == "sensor"
-        if wants_sensor and not dataset.has_depth:
-            raise DatasetError(
-                f"{dataset.path}: has no sensor depth (no depth images); run it with predicted depth: "
-                "--depth dinov2"
-            )
-        indices = options.indices(len(dataset))
-        check_scale_options(dataset, config, indices)
-        folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite)
-        seed_everything(config.seed)
-        given = create_depth_model(
-            config.depth.name, device=config.device, seed=config.seed, weights=config.depth.weights
-        )
-        scale = choose_prediction_scale(
-            dataset,
-            given,
-            config,
-            indices,
-            progress=lambda done, total: tell(RunProgress(Stage.SCALING, done, total)),
-            stop=stopped,
-        )
-        model = scale.applied_to(given)
-        seed_torch(config.seed)
-        tracker = _make_tracker(dataset, model, config)
-
-        folder.create(_arguments(options))
-        try:
-            write_log_to(log, folder / "log.txt")
-            write_text(folder / "config.yaml", _settings_text(options, config))
-            if scale.fit is not None:
-                write_scale(folder / "depth_scale.yaml", scale.fit)
-            logger.info(
-                "%s: %d of %d frames, depth by %s, %s features",
-                dataset.path,
-                len(indices),
-                len(dataset),
-                model.name,
-                config.features.name if config.odometry == "orb" else "no",
-            )
-            tracked = track(
-                dataset,
-                indices,
-                tracker,
-                folder / "trajectory_online.txt",
-                with_depth=wants_sensor,
-                progress=tell,
-                stop=stopped,
-            )
-        except SlamdepthError as error:
-            if not isinstance(error, OutputError):  # of a full disk, say, what is there is worth keeping
-                folder.discard()
-            raise
-        except BaseException:
-            logger.debug("the run broke off", exc_info=True)
-            raise
-        return _finish(dataset, model, scale, tracked, folder, options, config, tell)
+        job = _prepare(options, settings, tell, stopped)
+        tracked = _track(job, log, tell, stopped)
+        return _finish(job, tracked, tell)
 
 
-def _make_tracker(dataset: Dataset, model: DepthModel, config: Config) -> Any:
+@dataclass(frozen=True)
+class _Job:
+    """A run whose input is checked; nothing is written yet.
+
+    Attributes:
+        indices: which frames of the dataset are tracked.
+        model: the depth model as the tracker gets it, scaled where that was asked for.
+    """
+
+    options: RunOptions
+    config: Config
+    dataset: Dataset
+    indices: range
+    folder: RunFolder
+    model: DepthModel
+    scale: PredictionScale
+    tracker: AnyTracker
+
+    @property
+    def depth_is_measured(self) -> bool:
+        return is_sensor(self.model)
+
+
+def _settings(config: Config | str | Path | None, depth: str | None) -> Config:
+    """``config``, read where it is a file, with the depth model named ``depth``."""
+    if not isinstance(config, Config):
+        config = Config() if config is None else Config.from_yaml(config)
+    if depth is None or depth == config.depth.name:
+        return config
+    return Config.from_dict(merge(config.model_dump(), {"depth": {"name": depth}}))
+
+
+def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: threading.Event) -> _Job:
+    """Open and check everything that a run needs, what costs least first."""
     from slamdepth.tracking import create_tracker
 
-    return create_tracker(dataset.camera, depth_model=model, config=config)
+    dataset = open_dataset(options.sequence, options.camera_file)
+    indices = options.indices(len(dataset))
+    check_scale_options(dataset, config, indices)
+    folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite)
+    seed_everything(config.seed)
+    given = create_depth_model(
+        config.depth.name, device=config.device, seed=config.seed, weights=config.depth.weights
+    )
+    if is_sensor(given) and not dataset.has_depth:
+        raise DatasetError(
+            f"{dataset.path}: has no sensor depth (no depth images); run it with predicted depth: "
+            "--depth dinov2"
+        )
+    scale = choose_prediction_scale(
+        dataset,
+        given,
+        config,
+        indices,
+        progress=lambda done, total: tell(RunProgress(RunStage.SCALING, done, total)),
+        stop=stop,
+    )
+    model = scale.applied_to(given)
+    seed_torch(config.seed)
+    tracker = create_tracker(dataset.camera, depth_model=model, config=config)
+    return _Job(options, config, dataset, indices, folder, model, scale, tracker)
 
 
-def _finish(
-    dataset: Dataset,
-    model: DepthModel,
-    scale: PredictionScale,
-    tracked: Tracked,
-    folder: RunFolder,
-    options: RunOptions,
-    config: Config,
-    tell: ProgressCallback,
-) -> RunResult:
+def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threading.Event) -> Tracked:
+    """Make the run folder and feed the tracker; bad images leave no folder behind."""
+    config, dataset, folder = job.config, job.dataset, job.folder
+    folder.create(_arguments(job.options))
+    try:
+        write_log_to(log, folder / "log.txt")
+        write_text(folder / "config.yaml", _settings_text(job.options, config))
+        if job.scale.fit is not None:
+            write_scale(folder / "depth_scale.yaml", job.scale.fit)
+        logger.info(
+            "%s: %d of %d frames, depth by %s, %s features",
+            dataset.path,
+            len(job.indices),
+            len(dataset),
+            job.model.name,
+            config.features.name if config.odometry == "orb" else "no",
+        )
+        return track(
+            dataset,
+            job.indices,
+            job.tracker,
+            folder / "trajectory_online.txt",
+            with_depth=job.depth_is_measured,
+            progress=tell,
+            stop=stop,
+        )
+    except SlamdepthError as error:
+        if not isinstance(error, OutputError):  # of a full disk, say, what is there is worth keeping
+            folder.discard()
+        raise
+    except BaseException:
+        logger.debug("the run broke off", exc_info=True)
+        raise
+
+
+def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     """Everything after tracking; the trajectory first, since it is what was asked for."""
+    config, dataset, folder, scale = job.config, job.dataset, job.folder, job.scale
     reconstruction, scale_facts, scale_notes = settle_scale(dataset, tracked.reconstruction, scale, config)
     write_tum_trajectory(folder / "trajectory.txt", reconstruction.trajectory)
     write_tum_trajectory(folder / "keyframes.txt", keyframe_trajectory(reconstruction))
     notes = [*dataset.notes, *tracked.notes, *scale_notes]
+    mesh, mesh_images, mesh_notes = _mesh(job, reconstruction, tell)
 
-    mesh: MeshCounts | None = None
-    images: tuple[MeshImage, ...] = ()
-    if options.mesh:
-        tell(RunProgress(Stage.MESHING))
-        try:
-            mesh, images, mesh_notes = write_keyframe_mesh(reconstruction, config, folder / "mesh.ply", tell)
-        except SlamdepthError as error:
-            mesh_notes = (f"no mesh: {error}",)
-        for note in mesh_notes:
-            logger.warning("%s", note)
-        notes += mesh_notes
-    if images:
-        write_mesh_png(folder / "mesh.png", images)
-
-    optional = (("mesh.ply", mesh), ("mesh.png", images), ("depth_scale.yaml", scale.fit))
-    absent = {name for name, is_there in optional if not is_there}
-    tell(RunProgress(Stage.SCORING))
+    tell(RunProgress(RunStage.SCORING))
     trajectory_score, score_notes = judge_trajectory(
-        dataset, reconstruction.trajectory, is_measured=config.depth.name == "sensor"
+        dataset, reconstruction.trajectory, is_measured=job.depth_is_measured
     )
-    notes += score_notes
+    optional = (("mesh.ply", mesh), ("mesh.png", mesh_images), ("depth_scale.yaml", scale.fit))
+    absent = {name for name, is_there in optional if not is_there}
     summary = write_report(
         folder.path,
         ReportData(
             sequence=dataset.name,
-            depth_model=model.name,
-            depth_is_measured=is_sensor(model),
+            depth_model=job.model.name,
+            depth_is_measured=job.depth_is_measured,
             reconstruction=reconstruction,
             fps=tracked.fps,
             config=config,
             scale=scale_facts,
-            weights=(*model.weights, *feature_weights(config.features)),
+            weights=(*job.model.weights, *feature_weights(config.features)),
             steps=tracked.steps,
             trajectory_score=trajectory_score,
             depth_score=score_depth(dataset, reconstruction.keyframes),
             mesh=mesh,
-            mesh_images=images,
+            mesh_images=mesh_images,
             skipped_frames=tracked.skipped,
-            notes=tuple(notes),
-            options=_reported_options(options, tracked),
+            notes=(*notes, *mesh_notes, *score_notes),
+            options=_reported_options(job.options, tracked),
             files={name: what for name, what in FILES.items() if name not in absent},
         ),
     )
     logger.info("done: %s", folder.path)
-    return RunResult(folder.path, summary, tracked.interrupted)
+    return RunResult(folder.path, summary, reconstruction, tracked.interrupted)
+
+
+def _mesh(
+    job: _Job, reconstruction: Reconstruction, tell: ProgressCallback
+) -> tuple[MeshCounts | None, tuple[MeshImage, ...], tuple[str, ...]]:
+    """Write ``mesh.ply`` and ``mesh.png`` where a mesh was asked for; trouble becomes a note."""
+    if not job.options.mesh:
+        return None, (), ()
+    tell(RunProgress(RunStage.MESHING))
+    mesh: MeshCounts | None = None
+    images: tuple[MeshImage, ...] = ()
+    try:
+        mesh, images, notes = write_keyframe_mesh(reconstruction, job.config, job.folder / "mesh.ply", tell)
+    except SlamdepthError as error:
+        notes = (f"no mesh: {error}",)
+    for note in notes:
+        logger.warning("%s", note)
+    if images:
+        write_mesh_png(job.folder / "mesh.png", images)
+    return mesh, images, notes
 
 
 def seed_everything(seed: int) -> None:
@@ -228,7 +292,7 @@ def _reported_options(options: RunOptions, tracked: Tracked) -> dict[str, object
 
 
 def _arguments(options: RunOptions) -> list[str]:
-    """What the command line was given beside the settings and the place of the results."""
+    """What the command line was given, without the settings and the run folder."""
     arguments = [str(options.sequence)]
     if options.camera_file is not None:
         arguments += ["--camera", str(options.camera_file)]
@@ -245,6 +309,6 @@ def _settings_text(options: RunOptions, config: Config) -> str:
         "# The settings of this run; 'slamdepth run SEQ --config' reads them back. These are not read back:",
         f"# sequence: {Path(options.sequence).name}, --camera: {camera}",
         f"# stride: {options.stride}, max frames: {options.max_frames}, mesh: {options.mesh}",
-        "# For the same run again give them anew; README.txt has the command.",
+        "# For the same run again, give them again; README.txt has the command.",
     ]
     return "\n".join(lines) + "\n" + config.to_yaml()

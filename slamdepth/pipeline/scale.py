@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settled after tracking: the scale of the map, and one sentence about it.
+"""After tracking: the final scale of the map, and one sentence about it.
 
-The whole map may be multiplied, by what known sizes say or, asked for by name, by the scale
-of the ground truth's trajectory. Known sizes are combined with the scale that predictions
-gave the map.
+The whole map may be multiplied: by what known sizes say, combined with the scale that the depth gave the
+map, or, where that is asked for, by the scale of the ground truth's trajectory.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -38,79 +38,113 @@ _NO_CLAIM = "the scale was taken from ground truth: SE(3) ATE is not a metric cl
 def settle_scale(
     dataset: Dataset, reconstruction: Reconstruction, before: PredictionScale, config: Config
 ) -> tuple[Reconstruction, ScaleFacts, tuple[str, ...]]:
-    """The reconstruction at its final scale, the facts about it, and notes on what failed."""
-    votes = np.array(reconstruction.statistics.scale_votes)
-    spread = float(np.std(votes)) if len(votes) else None
-    own = ScaleEstimate(before.source, 1.0, before.sigma_log, before.how)
-    if spread is not None:
-        own = ScaleEstimate(
-            own.source, 1.0, math.hypot(before.sigma_log, spread / math.sqrt(len(votes))), own.how
-        )
-    found, notes = _known_sizes(dataset, reconstruction, before, config)
-    measured = None
-    if before.fit is not None:
-        try:
-            keyframes = reconstruction.keyframes
-            frames = read_with_depth(dataset, [k.frame.index for k in keyframes], lambda done, total: None)
-            own = measured = from_sensor(keyframes, frames)
-        except DatasetError as error:
-            notes.append(f"the map's own scale was not compared with the sensor: {error}")
-    prediction_factor = before.scale.scale if before.scale is not None else 1.0
-    parts: tuple[ScalePart, ...] = ()
-    from_ground_truth = before.from_ground_truth
-    if not found:
-        estimate = own
-        sentence = (
-            _own_sentence(before, len(votes), spread, own.sigma_log)
-            if measured is None
-            else _measured_sentence(before, measured)
-        )
-    elif before.wants_trajectory:
-        estimate, from_ground_truth = found[0], True
-        sentence = (
-            f"the map was multiplied by {estimate.factor:.4g} (± {100 * estimate.sigma_log:.2g} %) after "
-            f"{estimate.how}"
-        )
-    else:
-        together = [own, *found]
-        factor, sigma_log, weights = fused(together)
-        parts = tuple(
-            ScalePart(e.source, prediction_factor * e.factor, e.sigma_log, w)
-            for e, w in zip(together, weights, strict=True)
-        )
-        largest = max(parts, key=lambda part: part.weight).source
-        estimate = ScaleEstimate(largest, factor, sigma_log, "")
-        sentence = _fused_sentence(together, weights, estimate)
-    sentence += "".join(f"; {note}" for note in notes)
-    if found and not before.wants_trajectory:
-        notes += _disagreements(own, found)
-    if from_ground_truth:
-        sentence += f"; {_NO_CLAIM}"
-    shift = before.scale.shift if before.scale is not None and before.scale.shift else None
+    """Settle the scale of a finished map.
+
+    Args:
+        reconstruction: as the tracker returned it.
+        before: what was applied to the predictions it was made of.
+
+    Returns:
+        The reconstruction at its final scale, the facts about that scale, and notes on what failed.
+    """
+    votes = reconstruction.statistics.scale_votes
+    spread = float(np.std(votes)) if votes else None
+    own, own_sentence, own_notes = _own_scale(dataset, reconstruction, before, spread)
+    known, notes = _known_sizes(dataset, reconstruction, before, config)
+    notes += own_notes
+    verdict = _verdict(before, own, own_sentence, known)
+    claim = [_NO_CLAIM] if verdict.from_ground_truth else []
+    sentence = "; ".join([verdict.sentence, *notes, *claim])
+    if known and not before.wants_trajectory:
+        notes += _disagreements(own, known)
+    is_unknown = before.source is ScaleSource.VALUE and not known
+    shifted = before.scale if before.scale is not None and before.scale.shift else None
     facts = ScaleFacts(
-        source=estimate.source,
-        factor=prediction_factor * estimate.factor,
+        source=verdict.estimate.source,
+        factor=before.prediction_factor * verdict.estimate.factor,
         sentence=sentence,
-        uncertainty_log=None if before.source is ScaleSource.VALUE and not found else estimate.sigma_log,
+        uncertainty_log=None if is_unknown else verdict.estimate.sigma_log,
         keyframes=len(votes),
         spread=spread,
-        prediction_factor=prediction_factor,
-        shift=shift,
-        shift_unit=before.scale.domain.shift_unit if before.scale is not None and shift else None,
-        from_ground_truth=from_ground_truth,
-        parts=parts,
+        prediction_factor=before.prediction_factor,
+        shift=None if shifted is None else shifted.shift,
+        shift_unit=None if shifted is None else shifted.domain.shift_unit,
+        from_ground_truth=verdict.from_ground_truth,
+        parts=verdict.parts,
     )
     logger.info("scale: %s", sentence)
     for note in notes:
         logger.warning("%s", note)
-    if estimate.factor != 1.0:
-        reconstruction = rescaled(reconstruction, estimate.factor)
+    if verdict.estimate.factor != 1.0:
+        reconstruction = rescaled(reconstruction, verdict.estimate.factor)
     return reconstruction, facts, tuple(notes)
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """The factor on the finished map, and what is said of it."""
+
+    estimate: ScaleEstimate
+    sentence: str
+    from_ground_truth: bool
+    parts: tuple[ScalePart, ...] = ()
+
+
+def _own_scale(
+    dataset: Dataset, reconstruction: Reconstruction, before: PredictionScale, spread: float | None
+) -> tuple[ScaleEstimate, str, list[str]]:
+    """The scale that the depth gave the map, a sentence about it, and notes.
+
+    Where this run fitted the scale to the sensor, the finished map is compared with the sensor once more.
+
+    Args:
+        spread: standard deviation of the keyframes' votes, None without votes.
+    """
+    votes = len(reconstruction.statistics.scale_votes)
+    notes: list[str] = []
+    if before.fit is not None:
+        keyframes = reconstruction.keyframes
+        frames = read_with_depth(dataset, [k.frame.index for k in keyframes], lambda done, total: None)
+        try:
+            measured = from_sensor(keyframes, frames)
+            return measured, _measured_sentence(before, measured), notes
+        except DatasetError as error:
+            notes.append(f"the map's own scale was not compared with the sensor: {error}")
+    sigma_log = before.sigma_log
+    if spread is not None:
+        sigma_log = math.hypot(sigma_log, spread / math.sqrt(votes))
+    own = ScaleEstimate(before.source, 1.0, sigma_log, before.how)
+    return own, _own_sentence(before, votes, spread, sigma_log), notes
+
+
+def _verdict(
+    before: PredictionScale, own: ScaleEstimate, own_sentence: str, known: list[ScaleEstimate]
+) -> _Verdict:
+    """Known sizes are combined with the map's own scale; the ground truth's trajectory replaces it."""
+    if not known:
+        return _Verdict(own, own_sentence, before.from_ground_truth)
+    if before.wants_trajectory:
+        estimate = known[0]
+        sentence = (
+            f"the map was multiplied by {estimate.factor:.4g} (± {100 * estimate.sigma_log:.2g} %) after "
+            f"{estimate.how}"
+        )
+        return _Verdict(estimate, sentence, True)
+    together = [own, *known]
+    factor, sigma_log, weights = fused(together)
+    parts = tuple(
+        ScalePart(e.source, before.prediction_factor * e.factor, e.sigma_log, w)
+        for e, w in zip(together, weights, strict=True)
+    )
+    largest = max(parts, key=lambda part: part.weight).source
+    estimate = ScaleEstimate(largest, factor, sigma_log, "")
+    return _Verdict(estimate, _fused_sentence(together, weights, estimate), before.from_ground_truth, parts)
 
 
 def _known_sizes(
     dataset: Dataset, reconstruction: Reconstruction, before: PredictionScale, config: Config
 ) -> tuple[list[ScaleEstimate], list[str]]:
+    """What each known size says of the scale, and a note for each that says nothing."""
     scale, trajectory = config.scale, reconstruction.trajectory
     tries: list[tuple[str, Callable[[], ScaleEstimate]]] = []
     if before.wants_trajectory and (truth := dataset.ground_truth) is not None:
@@ -146,7 +180,7 @@ def _own_sentence(before: PredictionScale, votes: int, spread: float | None, sig
         agreed = f", the robust centre over {votes} keyframes (their log ratios spread by {spread:.2f})"
     sure = f"true metres within about {100 * sigma_log:.0f} %"
     if before.source is ScaleSource.VALUE:
-        sure = "how true it is nobody measured"
+        sure = "its accuracy is unknown"
     else:
         sure += " in two of three places, an assumption"
     if before.source is ScaleSource.NETWORK:
@@ -162,13 +196,13 @@ def _measured_sentence(before: PredictionScale, measured: ScaleEstimate) -> str:
 
 
 def _fused_sentence(together: list[ScaleEstimate], weights: tuple[float, ...], result: ScaleEstimate) -> str:
-    told = [
+    phrases = [
         f"{e.how} (factor {e.factor:.3f} ± {100 * e.sigma_log:.2g} %, weight {100 * w:.3g} %)"
         for e, w in zip(together, weights, strict=True)
     ]
     return (
         f"the map was multiplied by {result.factor:.4g} (± {100 * result.sigma_log:.2g} %), combined by "
-        f"inverse variance of log scale from {'; '.join(told[1:])}; and {told[0]}"
+        f"inverse variance of log scale from {'; '.join(phrases[1:])}; and {phrases[0]}"
     )
 
 

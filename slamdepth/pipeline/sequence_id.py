@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which sequence this is, wherever it lies and whatever its folder is called."""
+"""An identifier of a sequence that does not depend on where it lies or what its folder is called."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from slamdepth.training.data import fingerprint
 def sequence_id(dataset: Dataset) -> str:
     """Short hash of the times of ``dataset`` and of the names and sizes of its images.
 
-    Folders do not tell: all of 7-Scenes are called seq-NN.
+    Names of folders are not enough: all sequences of 7-Scenes are called seq-NN.
     """
     if isinstance(dataset, ImageSequence):
         files = [path for path in dataset.image_paths if is_file(path)]

@@ -15,13 +15,13 @@ from slamdepth.datasets import Dataset
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import TrajectoryWriter
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.pipeline.options import ProgressCallback, RunInterrupted, RunProgress, Stage
+from slamdepth.pipeline.options import ProgressCallback, RunInterrupted, RunProgress, RunStage
 from slamdepth.pipeline.prefetch import FramePrefetcher
 from slamdepth.types import Frame, StepResult
 
 logger = logging.getLogger(__name__)
 
-_WARNINGS = 5  # images named one by one before only their number is told
+_WARNINGS = 5  # images named one by one before only their number is logged
 
 
 class AnyTracker(Protocol):
@@ -41,8 +41,9 @@ class Tracked:
     Attributes:
         fps: frames over the wall time from the first step to the end of the optimisation.
         skipped: images that did not decode or are missing.
+        steps: one result for each frame, in order.
         interrupted: True where it was stopped before the last frame.
-        notes: what a reader of the report should know, one line each.
+        notes: for the report, one line each.
     """
 
     reconstruction: Reconstruction
@@ -76,7 +77,7 @@ def track(
     start_s: float | None = None
     total = len(indices)
     reader = FramePrefetcher(dataset, indices, with_depth=with_depth, prepare=tracker.prepare)
-    progress(RunProgress(Stage.TRACKING, 0, total))
+    progress(RunProgress(RunStage.TRACKING, 0, total))
     with reader, TrajectoryWriter(online_path) as online:
         for item in reader:
             if stop.is_set():
@@ -104,7 +105,7 @@ def track(
 
     done = len(steps) + skipped
     state = _state(steps[-1], done, total, len(steps), start_s)
-    progress(replace(state, stage=Stage.OPTIMISING))
+    progress(replace(state, stage=RunStage.OPTIMISING))
     finish_s = time.perf_counter()
     reconstruction = tracker.finish()
     statistics = reconstruction.statistics
@@ -149,7 +150,7 @@ def _warn(error: ImageDecodeError, count: int) -> None:
 
 def _state(result: StepResult, done: int, total: int, frames: int, start_s: float) -> RunProgress:
     return RunProgress(
-        Stage.TRACKING,
+        RunStage.TRACKING,
         done,
         total,
         frames / max(1e-9, time.perf_counter() - start_s),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth maps as pictures: dark blue near, over green, to yellow far, above a scale bar."""
+"""Depth maps as colour images: dark blue near, green, yellow far, above a scale bar."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from slamdepth.report.keyframe_images import UNKNOWN, colour_depth, rgb_of
 from slamdepth.types import DepthKind
+from slamdepth.typing import Bools
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,10 +28,10 @@ class Scale:
     """What the colours of a depth map stand for.
 
     Attributes:
-        near, far: the values drawn dark blue and yellow; metres where ``kind`` is METRIC, else
+        near, far: the values drawn dark blue and yellow; metres where ``kind`` is METRIC, otherwise
             without unit. Of inverse depth, ``near`` is the larger one.
         kind: what the values mean.
-        caution: a few words under the bar, such as what the metres rest on.
+        caution: a few words below the bar, such as what the metres rest on.
     """
 
     near: float
@@ -39,15 +40,17 @@ class Scale:
     caution: str = ""
 
 
-def known_pixels(values: NDArray[np.floating], kind: DepthKind) -> NDArray[np.bool_]:
-    """``(H, W)``, where there is a value: not 0 in metres; any finite number without unit, for the
-    zero of an affine map is a depth like others."""
-    finite = np.isfinite(values)
+def known_pixels(values: NDArray[np.floating], kind: DepthKind) -> Bools:
+    """``(H, W)``, where a map has a value.
+
+    In metres 0 is unknown. Without unit every finite number is a value, 0 too.
+    """
+    finite: Bools = np.isfinite(values)
     return finite & (values > 0) if kind is DepthKind.METRIC else finite
 
 
 def value_range(values: NDArray[np.floating], kind: DepthKind) -> tuple[float, float] | None:
-    """Near and far end of a map ``(H, W)``, the outermost hundredths cut off; None of nothing."""
+    """Near and far end of a map ``(H, W)``, the outermost hundredths cut off; None without values."""
     known = values[known_pixels(values, kind)]
     if len(known) == 0:
         return None
@@ -56,21 +59,22 @@ def value_range(values: NDArray[np.floating], kind: DepthKind) -> tuple[float, f
 
 
 def coloured(values: NDArray[np.floating], scale: Scale) -> NDArray[np.uint8]:
-    """A map ``(H, W)`` as colours ``(H, W, 3)`` RGB, grey where unknown."""
+    """A map ``(H, W)`` as colours ``(H, W, 3)`` uint8 RGB, grey where unknown."""
     return colour_depth(values, scale.near, scale.far, known_pixels(values, scale.kind))
 
 
-def depth_map_picture(values: NDArray[np.floating], scale: Scale) -> NDArray[np.uint8]:
-    """A map ``(H, W)`` in colour, ``(H + h, W, 3)`` RGB: its pixels stay where they are, the bar
-    is below them."""
+def depth_map_image(values: NDArray[np.floating], scale: Scale) -> NDArray[np.uint8]:
+    """A map ``(H, W)`` in colour with the scale bar below it, ``(H + h, W, 3)`` uint8 RGB."""
     return np.concatenate([coloured(values, scale), scale_bar(values.shape[1], scale)])
 
 
 def side_by_side(
     image_rgb: NDArray[np.uint8], values: NDArray[np.floating], scale: Scale, max_width: int = 960
 ) -> NDArray[np.uint8]:
-    """The image ``(H, W, 3)`` and its map ``(H, W)`` beside it, no wider than ``max_width`` pixels
-    each, above one scale bar; both sides are even, as video codecs want them."""
+    """An image ``(H, W, 3)`` and its map ``(H, W)`` side by side, above one scale bar, uint8 RGB.
+
+    Each is at most ``max_width`` pixels wide. Height and width are even, as video codecs require.
+    """
     import cv2
 
     height, width = image_rgb.shape[:2]
@@ -82,8 +86,8 @@ def side_by_side(
         colours = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.uint8)
     gap = np.full((size[1], 4, 3), rgb_of(_PAPER), np.uint8)
     pair = np.concatenate([image_rgb, gap, colours], axis=1)
-    picture = np.concatenate([pair, scale_bar(pair.shape[1], scale)])
-    return picture if len(picture) % 2 == 0 else np.concatenate([picture, picture[-1:]])
+    image = np.concatenate([pair, scale_bar(pair.shape[1], scale)])
+    return image if len(image) % 2 == 0 else np.concatenate([image, image[-1:]])
 
 
 def nice_ticks(low: float, high: float, most: int = _TICKS) -> list[float]:
@@ -122,7 +126,7 @@ def scale_bar(width: int, scale: Scale) -> NDArray[np.uint8]:
 
     left, right = pad, width - pad
     middle_y = pad + bar_height // 2
-    # On a picture too narrow for all words, the bar and its numbers come first.
+    # In an image too narrow for all words, the bar and its numbers come first.
     if length(title) + 2 * pad < 0.35 * width:
         draw.text((left, middle_y), title, font=font, fill=_INK, anchor="lm")
         left += length(title) + pad

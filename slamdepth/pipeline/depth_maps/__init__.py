@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From images or a video to depth maps in files: numbers, pictures, point clouds."""
+"""From images or a video to depth maps in files: numbers, colour images, point clouds."""
 
 from __future__ import annotations
 

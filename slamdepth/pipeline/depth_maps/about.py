@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a folder of depth maps says of itself: model, unit, intrinsics, notes."""
+"""The content of ``depth.json`` and the README of a folder of depth maps: model, unit, intrinsics, notes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from slamdepth import __version__
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics
-from slamdepth.depth.base import DepthModel
+from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.card import card_of
 from slamdepth.pipeline.depth_maps.folder import readme_head
 from slamdepth.pipeline.depth_maps.sources import Source
@@ -23,7 +23,7 @@ def images(number: int) -> str:
 
 
 def public_name(model: DepthModel) -> str:
-    """The model's name without the folders of this machine, for results are passed on."""
+    """The model's name without folders of this machine, since results are passed on."""
     return re.sub(r":(?!onnx:).*/", ":", model.name)  # mirrored:onnx:FILE has two names before its path
 
 
@@ -83,13 +83,13 @@ def about_folder(
 
 
 def scale_sentence(model: DepthModel, frames: list[dict[str, Any]]) -> str:
-    """What the numbers can be trusted for."""
+    """How far the numbers of the depth maps can be trusted."""
     if model.kind is not DepthKind.METRIC:
         return (
             f"{public_name(model)} predicts {model.kind.value}: known up to a scale and an offset, "
             "which differ from image to image; no number here is a length"
         )
-    if model.name == "sensor":
+    if is_sensor(model):
         return "metric, measured by the depth sensor"
     guessed = [frame for frame in frames if frame["certainty"] == Certainty.GUESSED.value]
     if guessed:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a depth map to colours and points, with what they rest on."""
+"""From a depth map to colours and points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics
-from slamdepth.depth.base import DepthModel
+from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.geometry import backproject
 from slamdepth.io import write_point_cloud
 from slamdepth.report.depth_map import Scale, known_pixels
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 def frame_scale(near: float, far: float, model: DepthModel, entry: dict[str, Any]) -> Scale:
-    """The colours' scale for the frame of a journal ``entry``, cautioned where its metres rest on a guess."""
-    is_predicted = model.kind is DepthKind.METRIC and model.name != "sensor"
+    """The colour scale of a journal ``entry``, with a caution where its metres rest on a guess."""
+    is_predicted = model.kind is DepthKind.METRIC and not is_sensor(model)
     is_guess = is_predicted and entry["certainty"] == Certainty.GUESSED.value
     return Scale(near, far, model.kind, "metres rest on a guessed focal length" if is_guess else "")
 
 
 def common_range(entries: list[dict[str, Any]], kind: DepthKind) -> tuple[float, float]:
-    """One near and far end for all frames: as all but their outermost twentieth reach."""
+    """One near and far end for all frames: the 5th and 95th percentile of their own ends."""
     towards_near, towards_far = (95, 5) if kind is DepthKind.AFFINE_INVERSE_DEPTH else (5, 95)
     near = np.percentile([entry["near"] for entry in entries], towards_near)
     far = np.percentile([entry["far"] for entry in entries], towards_far)
@@ -37,7 +37,7 @@ def common_range(entries: list[dict[str, Any]], kind: DepthKind) -> tuple[float,
 def write_cloud(
     path: Path, frame: Frame, depth_m: NDArray[np.float32], intrinsics: Intrinsics, model: str
 ) -> int:
-    """Write every known pixel of ``depth_m (H, W)`` as a coloured point of the camera frame.
+    """Write every known pixel of ``depth_m (H, W)`` metres as a coloured point in the camera frame.
 
     Returns:
         The number of points.

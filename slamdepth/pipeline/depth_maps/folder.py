@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of depth maps: where each file lies, what is done already, and what it explains of itself."""
+"""The folder of depth maps: where each file lies, and what is done already."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 from slamdepth.errors import ConfigError, OutputError
 from slamdepth.io import writable, write_json, write_text
+from slamdepth.pipeline.folder import make_folder, writing
 from slamdepth.types import DepthKind
 
 ABOUT = "depth.json"
@@ -37,13 +38,13 @@ _EXPLAINED = {
 
 @dataclass
 class DepthFolder:
-    """A place for the depth maps of one source.
+    """The folder of one source's depth maps.
 
     Attributes:
         path: the folder.
-        is_flat: True for the files of one image; else each sort has a folder of its own.
+        is_flat: True for the files of one image; otherwise each kind of file has a folder of its own.
         about: the content of ``depth.json``; empty in a new folder.
-        frames: what the journal says of each finished shot, by its name.
+        frames: the journal's entry of each finished shot, by its name.
     """
 
     path: Path
@@ -53,7 +54,7 @@ class DepthFolder:
 
     @classmethod
     def plan(cls, output: Path | None, source_name: str, *, is_flat: bool) -> DepthFolder:
-        """Choose and check the place, and read what is there already; nothing is written.
+        """Choose and check the folder, and read what is there already; nothing is written.
 
         Raises:
             OutputError: it is a file, holds something else, or cannot be written.
@@ -74,7 +75,7 @@ class DepthFolder:
         """Make sure that what is here was made with ``settings``.
 
         Raises:
-            ConfigError: it was not; names the first setting that differs, both values, and the way out.
+            ConfigError: it was not; names the first setting that differs, its two values, and what to do.
         """
         before = self.about.get("settings")
         if before is None:
@@ -93,17 +94,15 @@ class DepthFolder:
         Raises:
             OutputError: one cannot be removed.
         """
-        try:
+        with writing(self.path):
             for name in (VIDEO, JOURNAL, ABOUT):
                 (self.path / name).unlink(missing_ok=True)
             for ending in _EXPLAINED:
                 for folder in (self.path, self.path / Path(ending).stem):
                     for file in folder.glob(f"*.{ending}"):
                         file.unlink()
-                with suppress(OSError):  # not there, or it holds files of others
+                with suppress(OSError):  # not there, or it holds other files
                     (self.path / Path(ending).stem).rmdir()
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
         self.about, self.frames = {}, {}
 
     def discard(self) -> None:
@@ -119,14 +118,12 @@ class DepthFolder:
         Raises:
             OutputError: it cannot be written.
         """
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
+        make_folder(self.path)
+        with writing(self.path):
             for file_kind in kinds:
                 self.place(file_kind, "x", kind).parent.mkdir(exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
         self.write_readme([f"{_MARK}, not finished yet: the same command goes on."], [])
-        # Whole lines again where a kill cut the last one.
+        # A kill may have cut the last line.
         write_text(self.path / JOURNAL, "".join(_line(entry) for entry in self.frames.values()))
 
     def place(self, file_kind: str, name: str, kind: DepthKind) -> Path:
@@ -142,11 +139,8 @@ class DepthFolder:
             OutputError: the journal cannot be written.
         """
         path = self.path / JOURNAL
-        try:
-            with path.open("ab", buffering=0) as file:
-                file.write(_line(entry).encode("utf-8"))
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        with writing(path), path.open("ab", buffering=0) as file:
+            file.write(_line(entry).encode("utf-8"))
         self.frames[entry["name"]] = json.loads(_line(entry))
 
     def write_about(self, about: dict[str, Any]) -> None:
@@ -160,14 +154,14 @@ class DepthFolder:
         if (self.path / VIDEO).exists():
             files[VIDEO] = "image and colour map side by side, one range of colours throughout"
         files[ABOUT] = "model, weights, unit, intrinsics and notes, for programs"
-        files[JOURNAL] = "a line for each image: where it is from, its camera, its range of values"
+        files[JOURNAL] = "a line for each image: its origin, camera and range of values"
         width = max(map(len, files))
         lines = [*head, "", *(f"{name:<{width}}  {what}" for name, what in files.items())]
         write_text(self.path / README, "\n".join(lines) + "\n")
 
 
 def file_name(file_kind: str, kind: DepthKind) -> str:
-    """The part of a file's name behind the shot's, which says what its numbers are."""
+    """The part of a file's name after the shot's, which says what its numbers are."""
     if file_kind == VALUES:
         return f"{_VALUES_NAMES[kind]}.npy"
     return f"{file_kind}.ply" if file_kind == CLOUD else f"{file_kind}.png"
@@ -196,7 +190,7 @@ def _read_about(path: Path) -> dict[str, Any]:
 
 
 def _read_journal(path: Path) -> dict[str, dict[str, Any]]:
-    """Entries by name; a line that a kill cut, or anything else, counts as not done."""
+    """Entries by name; a line that is no entry, such as one that a kill cut, is ignored."""
     frames: dict[str, dict[str, Any]] = {}
     try:
         text = path.read_bytes().decode("utf-8", errors="replace")

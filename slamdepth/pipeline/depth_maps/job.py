@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth maps of images, folders and videos: predict, write, draw; resumable at any frame.
 
-Two passes. The first predicts and writes numbers and clouds, a shot at a time. The second
-draws those colour maps whose range is known only then: of a video or a sequence all share one,
-so that they do not flicker.
+There are two passes. The first predicts and writes numbers and clouds, a shot at a time. The second draws
+the colour maps of a video or sequence: they share one range of values, so that they do not flicker, and it
+is known only then.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.datasets.intrinsics import Certainty
-from slamdepth.depth.base import DepthModel
+from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import (
     CameraError,
@@ -46,8 +46,8 @@ from slamdepth.pipeline.depth_maps.options import (
     Progress,
 )
 from slamdepth.pipeline.depth_maps.sources import Shot, Source, SourceKind, open_source
-from slamdepth.pipeline.depth_maps.video import film_writer
-from slamdepth.report.depth_map import Scale, depth_map_picture, known_pixels, side_by_side, value_range
+from slamdepth.pipeline.depth_maps.video import video_writer
+from slamdepth.report.depth_map import Scale, depth_map_image, known_pixels, side_by_side, value_range
 from slamdepth.types import DepthKind
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_MUCH_BYTES = 1e9  # from here on the user is told what is coming
+_MUCH_BYTES = 1e9  # from here on the user is warned
 
 
 def make_depth_maps(
@@ -67,8 +67,9 @@ def make_depth_maps(
     """Predict the depth of every image of a source and write it in every form.
 
     Args:
+        options: which source, where to, which model.
         progress: called after each shot.
-        stop: set it, from any thread or a signal handler, to stop after the shot at hand.
+        stop: set it, from any thread or a signal handler, to stop after the current shot.
 
     Raises:
         InputError: the source, the camera, a setting or the output place is wrong, or the
@@ -81,14 +82,13 @@ def make_depth_maps(
         camera_file=options.camera_file,
         stride=options.stride,
         max_frames=options.max_frames,
-        with_depth=options.depth == "sensor",
     )
-    if options.depth == "sensor" and not source.has_depth:
+    folder = DepthFolder.plan(options.output, source.name, is_flat=source.kind is SourceKind.IMAGE)
+    model = create_depth_model(options.depth, device=options.device, weights=options.weights)
+    if is_sensor(model) and not source.has_depth:
         raise DatasetError(
             f"{options.source}: has no sensor depth; choose a predicted depth (--depth dinov2)"
         )
-    folder = DepthFolder.plan(options.output, source.name, is_flat=source.kind is SourceKind.IMAGE)
-    model = create_depth_model(options.depth, device=options.device, weights=options.weights)
     if options.colour_range is not None and model.kind is not DepthKind.METRIC:
         raise ConfigError(f"'{model.name}' predicts {model.kind.value}: its colours have no range in metres")
     settings = _settings(options, source, model)
@@ -135,9 +135,9 @@ class _Job:
         self.files = [COLOUR, VALUES]
         if self.is_metric:
             self.files += [MILLIMETRES, CLOUD] if options.cloud else [MILLIMETRES]
-        # A film's colours wait for all of it, unless the user said what they are.
+        # The range of a video's colours is known after the last frame, unless the user gave it.
         self.draws_later = source.fps is not None and options.colour_range is None
-        self.told: set[str] = set()
+        self.warned: set[str] = set()
         self.names: list[str] = []
         self.skipped: list[dict[str, str]] = []
 
@@ -147,18 +147,18 @@ class _Job:
             self._write_about(complete=False)
             self._predict_all()
         except SlamdepthError:
-            if not self.folder.frames:  # nothing of worth is lost
+            if not self.folder.frames:  # nothing is lost
                 self.folder.discard()
             raise
         if self.source.fps is not None:
-            self._draw_film()
+            self._draw_video()
         self._write_about(complete=True)
         self.folder.write_readme(readme_text(self.folder.about), self.files, self.model.kind)
         return DepthMapResult(self.folder.path, self.folder.about)
 
     def _predict_all(self) -> None:
         total = len(self.source)
-        for done, shot in enumerate(self._shots("predicting")):
+        for done, shot in enumerate(self._shots("predicting", with_depth=is_sensor(self.model))):
             try:
                 if not self._is_done(shot):
                     self._predict(shot)
@@ -176,8 +176,8 @@ class _Job:
             why = self.skipped[0]["reason"] if self.skipped else "it is empty"
             raise DatasetError(f"{self.options.source}: not one image could be used; the first: {why}")
 
-    def _shots(self, doing: str) -> Iterator[Shot]:
-        for shot in self.source.shots():
+    def _shots(self, doing: str, *, with_depth: bool = False) -> Iterator[Shot]:
+        for shot in self.source.shots(with_depth=with_depth):
             if self.stop.is_set():
                 raise DepthMapsInterrupted(
                     f"interrupted while {doing}: {images(len(self.names))} done, in {self.folder.path}; "
@@ -206,10 +206,14 @@ class _Job:
 
     def _predict(self, shot: Shot) -> None:
         frame, intrinsics = shot.read()
-        if self.options.depth == "sensor" and frame.depth_m is None:
+        if is_sensor(self.model) and frame.depth_m is None:
             raise ImageDecodeError(f"{shot.origin} has no sensor depth")
-        if intrinsics.certainty is not Certainty.GIVEN and self.is_metric and intrinsics.how not in self.told:
-            self.told.add(intrinsics.how)
+        if (
+            intrinsics.certainty is not Certainty.GIVEN
+            and self.is_metric
+            and intrinsics.how not in self.warned
+        ):
+            self.warned.add(intrinsics.how)
             logger.warning("%s: focal length: %s", shot.origin, intrinsics.how)
         values = self.model.predict(frame).values
         ends = value_range(values, self.model.kind)
@@ -238,25 +242,33 @@ class _Job:
         self.folder.record(entry)
 
     def _draw(self, name: str, values: NDArray[np.float32], scale: Scale) -> None:
-        write_png(self._place(COLOUR, name), depth_map_picture(values, scale))
+        write_png(self._place(COLOUR, name), depth_map_image(values, scale))
 
-    def _draw_film(self) -> None:
-        """Colour maps with one range for all, and the film."""
+    def _draw_video(self) -> None:
+        """Colour maps with one range for all, and the video."""
         entries = [self.folder.frames[name] for name in self.names]
         near, far = self.options.colour_range or common_range(entries, self.model.kind)
-        drawn: dict[str, Any] = {"near": near, "far": far}
-        if self.folder.about.get("colours") != drawn and self.draws_later:
+        colours: dict[str, Any] = {"near": near, "far": far}
+        if self.folder.about.get("colours") != colours and self.draws_later:
             for name in self.folder.frames:
                 self._place(COLOUR, name).unlink(missing_ok=True)
-        self._write_about(complete=False, drawn={"colours": drawn})
-        film = {"frames": len(self.names), "last": self.names[-1], **drawn}
-        path = self.folder.path / VIDEO
-        missing = [name for name in self.names if not self._place(COLOUR, name).is_file()]
-        if not missing and path.is_file() and self.folder.about.get("film") == film:
-            return
-        scale, wanted, fps = frame_scale(near, far, self.model, entries[0]), set(self.names), self.source.fps
+        self._write_about(complete=False, drawn={"colours": colours})
+        video = {"frames": len(self.names), "last": self.names[-1], **colours}
+        if not self._is_drawn(video):
+            self._write_video(frame_scale(near, far, self.model, entries[0]))
+            self._write_about(complete=False, drawn={"colours": colours, "video": video})
+
+    def _is_drawn(self, video: dict[str, Any]) -> bool:
+        return (
+            self.folder.about.get("video") == video
+            and (self.folder.path / VIDEO).is_file()
+            and all(self._place(COLOUR, name).is_file() for name in self.names)
+        )
+
+    def _write_video(self, scale: Scale) -> None:
+        fps, wanted = self.source.fps, set(self.names)
         assert fps is not None
-        with film_writer(path, fps) as add:
+        with video_writer(self.folder.path / VIDEO, fps) as add:
             done = 0
             for shot in self._shots("drawing"):
                 if shot.name not in wanted:
@@ -268,24 +280,23 @@ class _Job:
                 add(side_by_side(frame.image_rgb, values, scale))
                 done += 1
                 self.progress("drawing", done, len(wanted))
-        self._write_about(complete=False, drawn={"colours": drawn, "film": film})
 
     def _check_space(self, name: str, total: int) -> None:
-        """After the first image: is there room for the others, and is it much that they take?
+        """After the first image: compare what the others will take with the free space.
 
-        What is drawn at the end, colour maps and the film, is small beside it and not counted.
+        Colour maps and the video, which are drawn at the end, are small by comparison and not counted.
         """
         sizes = {kind: self._place(kind, name).stat().st_size for kind in self._now_files()}
         others = total - len([n for n in self.folder.frames if n != name]) - 1
-        still, clouds = others * sum(sizes.values()), sizes.get(CLOUD, 0)
+        needed, clouds = others * sum(sizes.values()), sizes.get(CLOUD, 0)
         free = shutil.disk_usage(self.folder.path).free
-        if still > free:
+        if needed > free:
             leave_out = "leave out the point clouds (--no-cloud), " if clouds else ""
             raise OutputError(
-                f"{self.folder.path}: {still / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB free; "
+                f"{self.folder.path}: {needed / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB free; "
                 f"{leave_out}take fewer images (--stride, --max-frames)"
             )
-        if still > _MUCH_BYTES:
+        if needed > _MUCH_BYTES:
             less = (
                 f"--no-cloud leaves out {clouds / sum(sizes.values()):.0%} of that"
                 if clouds
@@ -294,14 +305,14 @@ class _Job:
             logger.warning(
                 "%s still to do, about %.1f GB, %.1f GB free; %s",
                 images(others),
-                still / 1e9,
+                needed / 1e9,
                 free / 1e9,
                 less,
             )
 
     def _write_about(self, *, complete: bool, drawn: dict[str, Any] | None = None) -> None:
         kept: dict[str, Any] = {
-            key: self.folder.about[key] for key in ("colours", "film") if key in self.folder.about
+            key: self.folder.about[key] for key in ("colours", "video") if key in self.folder.about
         }
         about = about_folder(
             self.source,

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from slamdepth.errors import ConfigError, SlamdepthError
+from slamdepth.pipeline.options import check_frames_asked
 
 Progress = Callable[[str, int, int], None]
-"""Told what is being done, how many shots are, and how many there will be (0 = not known)."""
+"""Called with what is being done, how many shots are done, and how many there are (0 = unknown)."""
 
 
 @dataclass(frozen=True)
@@ -22,11 +23,15 @@ class DepthMapOptions:
         source: an image, a folder of images, a video, or a sequence of a known layout.
         output: folder for the results; None makes ``depth/<name>``.
         depth, weights: the depth model's name, and its weights file where it is not the usual one.
-        camera_file: a ``camera.yaml`` that overrules what else is known.
-        stride, max_frames: every so-manieth image, no more than so many.
+        camera_file: a ``camera.yaml``, which overrules everything else.
+        stride, max_frames: every Nth image, and at most this many.
         colour_range: near and far end of the colours in metres; None finds them.
         cloud: also write point clouds, by far the largest files.
+        device: where the network runs.
         overwrite: earlier depth maps in ``output`` may be replaced.
+
+    Raises:
+        ConfigError: a number is out of range.
     """
 
     source: Path
@@ -42,10 +47,7 @@ class DepthMapOptions:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise ConfigError(f"the stride must be 1 or more, got {self.stride}")
-        if self.max_frames is not None and self.max_frames < 1:
-            raise ConfigError(f"the number of frames must be 1 or more, got {self.max_frames}")
+        check_frames_asked(self.stride, self.max_frames)
         if self.colour_range is not None:
             near, far = self.colour_range
             if not (0 <= near < far < float("inf")):
@@ -56,13 +58,18 @@ class DepthMapOptions:
 
 @dataclass(frozen=True)
 class DepthMapResult:
-    """What is in the folder now: ``about`` is the content of its ``depth.json``."""
+    """What was made.
+
+    Attributes:
+        folder: the folder of depth maps.
+        about: the content of its ``depth.json``.
+    """
 
     folder: Path
     about: dict[str, Any]
 
 
 class DepthMapsInterrupted(SlamdepthError):
-    """Stopped before the last image; what is done stays, and the same call goes on."""
+    """Stopped before the last image. What is done stays, and the same call goes on from there."""
 
     exit_code = 130

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What depth maps are made of: an image, a folder of images, a video or a known sequence.
 
-All are a :class:`Source`: shots in order, each read only when it is wanted, so that what is
-done already costs nothing and memory does not grow with the length.
+Each is a :class:`Source`: shots in order, each read only when it is needed, so that finished shots cost
+nothing and memory does not grow with the length.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class Source(Protocol):
 
     Attributes:
         kind, name: what it is, and its short name.
-        fps: shots per second, None where they are no film.
-        camera: of all shots, where it is known and not only guessed.
+        fps: shots per second, None where they are single images.
+        camera: of all shots, None where it is unknown or guessed.
         has_depth: True where frames may carry sensor depth.
         stamp: differs for another source of the same name.
         notes: what was guessed or repaired, one line each.
@@ -82,18 +82,17 @@ class Source(Protocol):
         """Number of shots; of a video what the file says, 0 = does not say."""
         ...
 
-    def shots(self) -> Iterator[Shot]: ...
+    def shots(self, *, with_depth: bool = False) -> Iterator[Shot]:
+        """The shots in order; with ``with_depth`` their frames carry sensor depth where there is some."""
+        ...
 
 
-def open_source(
-    path: Path, *, camera_file: Path | None, stride: int, max_frames: int | None, with_depth: bool
-) -> Source:
+def open_source(path: Path, *, camera_file: Path | None, stride: int, max_frames: int | None) -> Source:
     """Find out what ``path`` is and open it.
 
     Args:
         camera_file: a ``camera.yaml`` that overrules whatever else is known of the camera.
-        stride, max_frames: every so-manieth image, and no more than so many.
-        with_depth: also read sensor depth where there is some.
+        stride, max_frames: every Nth image, and at most this many.
 
     Raises:
         DatasetError: nothing is there, or nothing in it can be read.
@@ -104,10 +103,10 @@ def open_source(
     try:
         if path.is_dir():
             if any(reader.matches(path) for reader in known_readers()):
-                return _SequenceSource(open_dataset(path, camera_file), chosen, with_depth)
+                return _SequenceSource(open_dataset(path, camera_file), chosen)
             if (path / "camera.json").is_file():
                 return _PairSource(PairReader().open(path), camera_file, chosen)
-            return _PictureSource(SourceKind.IMAGES, path, list_images(path)[chosen], camera_file)
+            return _ImageSource(SourceKind.IMAGES, path, list_images(path)[chosen], camera_file)
         if not path.exists():
             raise DatasetError(f"{path}: no such file or folder")
     except OSError as error:
@@ -115,12 +114,12 @@ def open_source(
     if path.suffix.lower() in VIDEO_ENDINGS:
         return _VideoSource(VideoFile(path), camera_file, chosen)
     if path.suffix.lower() in IMAGE_ENDINGS:
-        return _PictureSource(SourceKind.IMAGE, path, [path], camera_file)
+        return _ImageSource(SourceKind.IMAGE, path, [path], camera_file)
     known = ", ".join(ending.removeprefix(".") for ending in (*IMAGE_ENDINGS, *VIDEO_ENDINGS))
     raise DatasetError(f"{path}: neither a folder nor an image nor a video by its ending; known are {known}")
 
 
-class _PictureSource:
+class _ImageSource:
     fps: float | None = None
     has_depth = False
 
@@ -136,7 +135,7 @@ class _PictureSource:
     def __len__(self) -> int:
         return len(self._images)
 
-    def shots(self) -> Iterator[Shot]:
+    def shots(self, *, with_depth: bool = False) -> Iterator[Shot]:
         names = short_names(self._images)
         for index, (path, name) in enumerate(zip(self._images, names, strict=True)):
             yield Shot(name, path.name, _stamp(path), partial(read_image_frame, path, index, self._given))
@@ -154,7 +153,7 @@ class _VideoSource:
         self._max_frames = None if chosen.stop is None else chosen.stop // self._stride
         self.fps = video.fps / self._stride
         self._video = video
-        # A camera.yaml that lies beside a video may be another's: it must be named.
+        # A camera.yaml in the folder of a video may be another's: it must be named.
         given = None if camera_file is None else find_camera_file(video.path.parent, camera_file)
         self.camera = None if given is None else given[0]
         if given is None:
@@ -164,10 +163,10 @@ class _VideoSource:
             self._intrinsics = Intrinsics(*given, Certainty.GIVEN)
 
     def __len__(self) -> int:
-        named = -(-self._video.frames_named // self._stride)
+        named: int = -(-self._video.frames_named // self._stride)
         return named if self._max_frames is None else min(named or self._max_frames, self._max_frames)
 
-    def shots(self) -> Iterator[Shot]:
+    def shots(self, *, with_depth: bool = False) -> Iterator[Shot]:
         for count, (index, decode) in enumerate(self._video.frames(self._stride)):
             if count == self._max_frames:
                 return
@@ -179,7 +178,7 @@ class _VideoSource:
 
 
 class _PairSource:
-    """Training pairs, whose depth images must not be taken for pictures."""
+    """Training pairs, whose depth images are no colour images."""
 
     kind = SourceKind.PAIRS
     fps: float | None = None
@@ -198,7 +197,7 @@ class _PairSource:
     def __len__(self) -> int:
         return len(self._indices)
 
-    def shots(self) -> Iterator[Shot]:
+    def shots(self, *, with_depth: bool = False) -> Iterator[Shot]:
         for index in self._indices:
             path = self._place.images[index]
             yield Shot(path.stem, path.name, _stamp(path), partial(self._read, index))
@@ -214,7 +213,7 @@ class _PairSource:
 class _SequenceSource:
     kind = SourceKind.SEQUENCE
 
-    def __init__(self, dataset: Dataset, chosen: slice, with_depth: bool) -> None:
+    def __init__(self, dataset: Dataset, chosen: slice) -> None:
         self.name = dataset.name
         self.stamp = sequence_id(dataset)
         self.notes = list(dataset.notes)
@@ -223,18 +222,17 @@ class _SequenceSource:
         self.fps: float | None = dataset.camera.fps / chosen.step
         self._indices = range(len(dataset))[chosen]
         self._dataset = dataset
-        self._with_depth = with_depth
         self._intrinsics = Intrinsics(dataset.camera, "the sequence's own camera", Certainty.GIVEN)
 
     def __len__(self) -> int:
         return len(self._indices)
 
-    def shots(self) -> Iterator[Shot]:
+    def shots(self, *, with_depth: bool = False) -> Iterator[Shot]:
         for index in self._indices:
-            yield _numbered(index, partial(self._read, index))
+            yield _numbered(index, partial(self._read, index, with_depth))
 
-    def _read(self, index: int) -> tuple[Frame, Intrinsics]:
-        return self._dataset.read(index, with_depth=self._with_depth), self._intrinsics
+    def _read(self, index: int, with_depth: bool) -> tuple[Frame, Intrinsics]:
+        return self._dataset.read(index, with_depth=with_depth), self._intrinsics
 
 
 def _numbered(index: int, read: Callable[[], tuple[Frame, Intrinsics]]) -> Shot:

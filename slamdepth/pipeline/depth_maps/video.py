@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing a film frame by frame, whole or not at all."""
+"""Writing a video frame by frame, whole or not at all."""
 
 from __future__ import annotations
 
@@ -17,22 +17,25 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 CODECS = ("vp09", "mp4v")
-"""VP9 first: browsers and players know it, and OpenCV's own FFmpeg brings it along; H.264 it
-cannot write."""
+"""In order of preference. Browsers play VP9, and OpenCV's own FFmpeg can write it, unlike H.264."""
 
 MIN_FPS = 1.0
-"""No codec takes a frame an hour, and nobody watches it; images far apart are shown a second each."""
+"""Least frame rate: images that are far apart in time are shown for a second each."""
 
 
 @contextmanager
-def film_writer(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
-    """A function that adds a frame ``(H, W, 3)`` RGB, of one even size throughout, to an mp4 file.
+def video_writer(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+    """Write an mp4 file; it is moved to ``path`` when the block succeeds.
 
-    The file is moved to ``path`` when the block succeeds. It plays at ``fps``, at :data:`MIN_FPS` if that
-    is less.
+    Args:
+        path: the file.
+        fps: frames per second, raised to :data:`MIN_FPS` where it is less.
+
+    Yields:
+        A function that adds a frame ``(H, W, 3)`` uint8 RGB. All frames have one size, both sides even.
 
     Raises:
-        OutputError: no codec is there, or ``path`` cannot be written.
+        OutputError: OpenCV has no codec, or ``path`` cannot be written.
     """
     import cv2
 
@@ -51,7 +54,7 @@ def film_writer(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8]]
             if writer is not None:
                 writer.release()
         if not temporary.is_file() or temporary.stat().st_size == 0:
-            raise OutputError(f"{path}: the film could not be written")
+            raise OutputError(f"{path}: the video could not be written")
 
 
 def _open(temporary: Path, path: Path, fps: float, width: int, height: int) -> Any:

@@ -89,11 +89,11 @@ def test_a_bar_fits_any_width(width: int, kind: DepthKind) -> None:
 
 
 @pytest.mark.parametrize("size", [(47, 63), (48, 64), (1080, 1921)])
-def test_frames_of_a_film_have_even_sides(size: tuple[int, int]) -> None:
+def test_frames_of_a_video_have_even_sides(size: tuple[int, int]) -> None:
     image, values = np.zeros((*size, 3), np.uint8), np.ones(size, np.float32)
-    picture = side_by_side(image, values, Scale(0.5, 2.0, METRIC))
-    assert picture.shape[0] % 2 == picture.shape[1] % 2 == 0
-    assert picture.shape[1] <= 2 * 960 + 4
+    shown = side_by_side(image, values, Scale(0.5, 2.0, METRIC))
+    assert shown.shape[0] % 2 == shown.shape[1] % 2 == 0
+    assert shown.shape[1] <= 2 * 960 + 4
 
 
 def test_millimetres_are_rounded_and_what_does_not_fit_is_unknown(tmp_path: Path) -> None:
