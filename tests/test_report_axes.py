@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The axes of a report's plots: level where gravity is known, else honestly the first camera's."""
+"""The axes of a report's plots: level where gravity is known, otherwise the first camera's."""
 
 from __future__ import annotations
 

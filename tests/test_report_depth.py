@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pictures of judged depth say of themselves."""
+"""The plots of an evaluated depth model."""
 
 from __future__ import annotations
 
@@ -61,19 +61,19 @@ def test_errors_over_depth_start_where_there_are_pixels(
         }
         assert wanted <= shown
         assert not axis.get_ticklocs(minor=True).size
-    told = texts(figure)
-    assert {"hall", "as predicted", "after each frame's affine fit: factor and shift"} <= set(told)
-    assert "AbsRel: mean of |predicted - sensor| / sensor" in told
+    shown_texts = texts(figure)
+    assert {"hall", "as predicted", "after each frame's affine fit: factor and shift"} <= set(shown_texts)
+    assert "AbsRel: mean of |predicted - sensor| / sensor" in shown_texts
 
 
 def test_a_sheet_says_what_its_colours_mean(drawn: list[Any]) -> None:
     depth = np.linspace(1, 3, 48 * 64).reshape(48, 64)
     row = SheetRow(np.zeros((48, 64, 3), np.uint8), depth, 1.2 * depth)
     write_sheet(Path("x.png"), [row], "after each frame's median", "network on hall")
-    told = texts(drawn[0])
+    shown_texts = texts(drawn[0])
     for text in (
         "predicted, after each frame's median",
         "its error: red too far, blue too near",
         "error, % (±50: that or more)",
     ):
-        assert text in told
+        assert text in shown_texts

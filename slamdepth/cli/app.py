@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All commands together, and how errors end a process.
+"""All commands, and how errors end a process.
 
-Exit codes: 0 done (also for a run that was interrupted and finished with what it had),
-1 failed, 2 the input or the command line is wrong, 130 interrupted with nothing to save.
-Modules that take long to import are imported inside the commands.
+Exit codes: 0 done (also for a run that was interrupted and finished with the frames it had), 1 failed, 2 the
+input or the command line is wrong, 130 interrupted with nothing to save. Modules that take long to import are
+imported inside the commands.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from slamdepth.cli import data_stats, depth, eval_depth, evaluate, run, scale, s
 from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_verbose
 from slamdepth.errors import SlamdepthError
 
-# typer carries its own copy of click since 0.26 and uses click before: the name is found, not imported.
+# typer uses click before 0.26 and its own copy of click since: the class is looked up, not imported.
 _UsageProblem: type[Any] = next(cls for cls in typer.BadParameter.__mro__ if cls.__name__ == "ClickException")
 
 app = typer.Typer(
@@ -61,29 +61,29 @@ def _everything(
 
     Example: slamdepth synth room --frames 60, then slamdepth run room --depth sensor
 
-    'slamdepth COMMAND --help' tells what a command takes, with an example.
+    'slamdepth COMMAND --help' explains a command, with an example.
     """
 
 
 def main() -> NoReturn:
-    """Run the command line; errors made on purpose end in one line on standard error."""
-    # Read when PyTorch loads: waiting threads sleep. Spinning ones make the network ten times
-    # slower as soon as another program wants the processor.
+    """Run the command line; known errors end in one line on standard error."""
+    # Read when PyTorch loads. Spinning threads make the network ten times slower as soon as another
+    # program uses the processor.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         code = app(standalone_mode=False)
     except SlamdepthError as error:
-        _tell(str(error))
+        _print_error(str(error))
         code = error.exit_code
     except _UsageProblem as problem:
         # typer shows the help itself where no command is given; its message is then empty.
         if message := problem.format_message():
             context = getattr(problem, "ctx", None)
             command = getattr(context, "command_path", None) or "slamdepth"
-            _tell(f"{message}{_order(context, message)} (see '{command} --help')")
+            _print_error(f"{message}{_usage(context, message)} (see '{command} --help')")
         code = problem.exit_code
     except (KeyboardInterrupt, typer.Abort):
-        _tell("interrupted")
+        _print_error("interrupted")
         code = 130
     except BrokenPipeError:  # the reader of a pipe has gone: 'slamdepth ... | head'
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -92,16 +92,16 @@ def main() -> NoReturn:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _order(context: Any, message: str) -> str:
-    """What a command takes, in order, where one of that is missing; empty elsewhere."""
+def _usage(context: Any, message: str) -> str:
+    """The usage of the command where an argument is missing, otherwise an empty text."""
     if context is None or not message.startswith("Missing argument"):
         return ""
     pieces = " ".join(context.command.collect_usage_pieces(context))
     return f" Usage: {context.command_path} {pieces.translate(str.maketrans('', '', '{}'))}"
 
 
-def _tell(message: str) -> None:
-    """One line, however the message is broken."""
+def _print_error(message: str) -> None:
+    """Print an error in one line."""
     if is_verbose() and sys.exc_info()[0] is not None:
         error_console().print_exception()
     print("error:", " ".join(message.split()), file=sys.stderr)

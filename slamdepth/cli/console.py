@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all commands share: how loud they are, and where they write."""
+"""What all commands share: verbosity, and where they write."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ def _set_quiet(asked: bool) -> bool:
 
 VerboseOption = Annotated[
     bool,
-    typer.Option("--verbose", "-v", callback=_set_verbose, help="Tell everything; tracebacks of errors."),
+    typer.Option(
+        "--verbose", "-v", callback=_set_verbose, help="Print every message, and tracebacks of errors."
+    ),
 ]
 QuietOption = Annotated[
     bool, typer.Option("--quiet", "-q", callback=_set_quiet, help="Print errors and results only.")
@@ -39,12 +41,12 @@ QuietOption = Annotated[
 
 
 def is_verbose() -> bool:
-    """True where the user wants tracebacks: ``--verbose`` or ``SLAMDEPTH_DEBUG`` set."""
+    """True where the user wants tracebacks: with ``--verbose``, or where ``SLAMDEPTH_DEBUG`` is set."""
     return bool(os.environ.get("SLAMDEPTH_DEBUG"))
 
 
 def console() -> Console:
-    """Standard output: results; into a file or a pipe lines are as long as they are."""
+    """Standard output, for results; in a file or a pipe, lines are never broken."""
     from rich.console import Console
 
     out = Console(highlight=False, soft_wrap=False)
@@ -54,21 +56,21 @@ def console() -> Console:
 
 
 def print_places(out: Console, places: Mapping[str, object]) -> None:
-    """Print where each result lies, a line each; a path is never broken, so that it can be copied."""
+    """Print where each result lies, a line each. Paths are never broken, so that they can be copied."""
     width = max(map(len, places))
     for name, place in places.items():
         out.print(f"  {name:<{width}}   {place}", markup=False, soft_wrap=True)
 
 
 def error_console() -> Console:
-    """Standard error: progress, warnings, errors."""
+    """Standard error, for progress, warnings and errors."""
     from rich.console import Console
 
     return Console(stderr=True, highlight=False)
 
 
 def show_log(level: int = logging.WARNING, target: Console | None = None) -> None:
-    """Show slamdepth's messages of ``level`` and above on standard error; the first call sets the level."""
+    """Print slamdepth's messages of ``level`` and above on standard error; the first call sets the level."""
     package = logging.getLogger("slamdepth")
     known = [handler for handler in package.handlers if getattr(handler, "is_of_cli", False)]
     if known:

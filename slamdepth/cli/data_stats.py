@@ -24,7 +24,7 @@ def data_stats_command(
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="Also write a page, a picture and JSON here."),
+        typer.Option("--output", "-o", metavar="DIR", help="Also write a page, a plot and JSON here."),
     ] = None,
     stride: StrideOption = 1,
     max_frames: Annotated[
@@ -33,7 +33,7 @@ def data_stats_command(
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compare depth data: histograms, sparsity, ranges, number, image size, focal length.
+    """Compare depth data: histograms, sparsity, ranges, number and size of images, focal length.
 
     Example: slamdepth data-stats depth_training rgbd_dataset_freiburg1_rpy --output data-stats
     """

@@ -24,12 +24,12 @@ def evaluate_command(
     ] = None,
     fps: Annotated[
         float | None,
-        typer.Option(metavar="HZ", help="Poses per second, for RPE. Default: as the estimate's times say"),
+        typer.Option(metavar="HZ", help="Poses per second, for RPE. Default: from the times of the estimate"),
     ] = None,
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compare two TUM trajectory files: ATE and RPE, as evo's own commands give them.
+    """Compare two TUM trajectory files: ATE and RPE, equal to those of evo's own commands.
 
     Example: slamdepth evaluate desk/groundtruth.txt runs/desk/trajectory.txt --output score.json
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that mean the same wherever a command has them."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 DepthOption = Annotated[
     str,
-    typer.Option("--depth", metavar="NAME", help="Depth model; an unknown name lists those there are."),
+    typer.Option("--depth", metavar="NAME", help="Depth model; an unknown name lists all names."),
 ]
 DepthWeightsOption = Annotated[
     Path | None,

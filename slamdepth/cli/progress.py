@@ -7,9 +7,12 @@ from slamdepth.cli.console import error_console, show_log
 
 
 class JobBar:
-    """What is done of how much, and how long it will take; on a pipe a line now and then instead.
+    """A progress bar with the time left; where standard error is no terminal, a line now and then.
 
-    As a context manager; warnings are printed above the bar.
+    A context manager; warnings are printed above the bar.
+
+    Args:
+        quiet: show nothing.
     """
 
     def __init__(self, quiet: bool) -> None:
@@ -40,8 +43,13 @@ class JobBar:
         self._bar.stop()
 
     def show(self, doing: str, done: int, total: int, state: str = "") -> None:
-        """Show that ``done`` of ``total`` (0: unknown) are done, and ``state`` beside it; another
-        ``doing`` starts the bar anew."""
+        """Show that ``done`` of ``total`` (0: unknown) are done.
+
+        Args:
+            doing: the current job; another one restarts the bar.
+            done, total: finished and in all.
+            state: shown next to the bar.
+        """
         is_new = doing != self._doing
         if is_new:
             self._doing, self._next_line = doing, 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C and SIGTERM as an event, so that a job ends where nothing is lost."""
+"""Ctrl-C and SIGTERM as an event, so that a job can stop without losing anything."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ if TYPE_CHECKING:
 
 
 class Interrupted(SlamdepthError):
-    """The user broke a command off."""
+    """The user interrupted a command."""
 
     exit_code = 130
 
 
 @contextmanager
 def telling_what_is_kept(kept: Callable[[], str]) -> Iterator[None]:
-    """Ctrl-C ends the block at once; what ``kept`` says is then left is told in one line.
+    """Ctrl-C ends the block at once, with one line that says what is kept.
+
+    Args:
+        kept: called then; returns what is kept, as a phrase.
 
     Raises:
         Interrupted: Ctrl-C was pressed.

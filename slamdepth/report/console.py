@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables for a terminal, built here and printed by the command line."""
+"""Tables for a terminal; the command line prints them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def run_table(summary: dict[str, Any]) -> Table:
-    """What a run ends with.
+    """The figures that a run ends with.
 
     Args:
         summary: of :func:`slamdepth.report.build_summary`.
@@ -43,7 +43,7 @@ def run_table(summary: dict[str, Any]) -> Table:
 
 
 def _frame_rows(summary: dict[str, Any]) -> Rows:
-    """Where images could not be read, what was tracked is told as a share of all as well."""
+    """Frames and tracked frames; where images could not be read, also the share of all images."""
     frames, tracked, unread = summary["frames"], summary["tracked"], summary["skipped_frames"]
     placed = f"{count(tracked)} ({percent(summary['tracked_fraction'])})"
     if not unread:
@@ -56,24 +56,27 @@ def _frame_rows(summary: dict[str, Any]) -> Rows:
 
 
 def trajectory_table(figures: dict[str, Any], title: str = "trajectory", digits: int = 6) -> Table:
-    """The figures of ``TrajectoryScore.to_dict()``, lengths with so many digits after the point."""
+    """The figures of ``TrajectoryScore.to_dict()``, with ``digits`` digits after the point."""
     return two_columns(title, _score_rows(figures, digits))
 
 
 def scale_table(fit: ScaleFit) -> Table:
-    """A scale fitted to a sensor, with how sure it is."""
+    """A scale fitted to a sensor, with its uncertainty."""
     unit = fit.scale.domain.shift_unit
     has_shift = fit.shift_sigma is not None or fit.scale.shift != 0.0
-    sure = "one frame: unknown" if fit.scale_sigma_log is None else f"± {percent(fit.scale_sigma_log)}"
+    uncertainty = "one frame: unknown" if fit.scale_sigma_log is None else f"± {percent(fit.scale_sigma_log)}"
     rows = [
-        (f"scale of {fit.scale.domain.value}", f"{fit.scale.scale:.4g}{'' if has_shift else f' {sure}'}"),
+        (
+            f"scale of {fit.scale.domain.value}",
+            f"{fit.scale.scale:.4g}{'' if has_shift else f' {uncertainty}'}",
+        ),
         ("frames", f"{count(fit.frames)}, {count(fit.pixels)} pixels"),
         ("spread over frames", f"{fit.frame_spread_log:.3f} (std of the log of each frame's own factor)"),
     ]
     if has_shift:
         shift_sigma = MISSING if fit.shift_sigma is None else f"± {fit.shift_sigma:.3g} {unit}"
         rows.insert(1, ("shift", f"{fit.scale.shift:.4g} {shift_sigma}"))
-        rows.insert(2, ("depth by both", f"{sure} at the middle depth"))
+        rows.insert(2, ("depth by both", f"{uncertainty} at the middle depth"))
     return two_columns(f"{fit.model} on {fit.sequence}", rows)
 
 
@@ -94,7 +97,7 @@ def _score_rows(figures: dict[str, Any], digits: int) -> Rows:
 
 
 def two_columns(title: str, rows: Rows) -> Table:
-    """Texts are shown as they are: a path with brackets is no markup."""
+    """A table of names and values, shown as they are: brackets in a path are no markup."""
     from rich import box
     from rich.table import Table
     from rich.text import Text

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a finished run hands to its report."""
+"""The input of a report: everything a finished run knows."""
 
 from __future__ import annotations
 

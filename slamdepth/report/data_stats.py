@@ -25,7 +25,7 @@ HISTOGRAMS, PAGE = "histograms.png", "data-stats.html"
 _INK, _MUTED, _RULE, _BAR = "#14181f", "#5b6575", "#dfe3e9", "#9aa5b4"
 _BINS = 80
 _LONGEST_NAME = 32
-"""Longer names are broken in a terminal's table, so that its numbers need not be."""
+"""Longer names are broken in a terminal's table, so that numbers stay whole."""
 _DEPTHS = (
     ("min", "min_m"), ("1 %", "p1_m"), ("5 %", "p5_m"), ("median", "p50_m"),
     ("95 %", "p95_m"), ("99 %", "p99_m"), ("max", "max_m"),
@@ -37,7 +37,11 @@ class DataRow:
     """A data set, counted.
 
     Attributes:
-        size: how many images it has, looked at or not.
+        name: of the data set.
+        camera: its camera.
+        size: number of images it has, counted or not.
+        statistics: of the images that were counted.
+        notes: what was guessed, repaired or left out, one line each.
     """
 
     name: str
@@ -48,7 +52,7 @@ class DataRow:
 
 
 def looked_at(images: int, size: int) -> str:
-    """How many pairs a data set has, and of how many the figures are where those are not all."""
+    """The number of pairs of a data set, and how many of them were counted, unless all were."""
     return count(size) if images == size else f"{count(images)} of {count(size)}"
 
 
@@ -101,7 +105,7 @@ def write_data_page(folder: Path, rows: list[DataRow], about: dict[str, Any]) ->
     """Write ``histograms.png`` and ``data-stats.html``, which needs nothing else, into ``folder``.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: a file cannot be written.
     """
     png = histogram_image(rows)
     with replacing(folder / HISTOGRAMS) as temporary:
@@ -138,7 +142,7 @@ def histogram_image(rows: list[DataRow]) -> bytes:
 
 
 def _axis_ends_m(rows: list[DataRow]) -> tuple[float, float]:
-    """Wide enough for all but the outermost hundredths of every data set."""
+    """Ends of the depth axis: all but the outermost hundredths of every data set are on it."""
     nearest = [row.statistics.percentile_m(1.0) or 1.0 for row in rows]
     farthest = [row.statistics.percentile_m(99.0) or 1.0 for row in rows]
     return max(0.8 * min(nearest), 0.02), 1.15 * max(farthest)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judged depth for people: a table, a sheet of pictures, and errors over depth."""
+"""The evaluation of a depth model: a table, a sheet of images, and errors over depth."""
 
 from __future__ import annotations
 
@@ -54,11 +54,12 @@ _AROUND_ONE = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 1.75, 2.0, 2.5
 
 @dataclass(frozen=True)
 class SheetRow:
-    """A frame of the picture sheet.
+    """A frame of the sheet of images.
 
     Attributes:
         image_rgb: ``(H, W, 3)`` uint8.
-        sensor_m, predicted_m: ``(H, W)`` metres, 0 where unknown; the latter scaled.
+        sensor_m: ``(H, W)`` measured depth in metres, 0 where unknown.
+        predicted_m: ``(H, W)`` predicted depth in metres, scaled, 0 where unknown.
     """
 
     image_rgb: NDArray[np.uint8]
@@ -77,7 +78,7 @@ def with_half(figure: Interval | None, digits: int = 3) -> str:
 
 
 def judgement_table(ways: Mapping[str, Mapping[str, Interval]], title: str) -> Table:
-    """Figures as rows, ways of scaling as columns; those that do not exist are dashes."""
+    """Figures as rows, ways of scaling as columns; a dash where a figure does not exist."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
@@ -92,9 +93,9 @@ def judgement_table(ways: Mapping[str, Mapping[str, Interval]], title: str) -> T
 
 
 def model_lines(model: DepthModel) -> list[str]:
-    """What a model says of itself: what its numbers mean, what it was trained on, and its files."""
+    """A model in a few lines: what its numbers mean, what it was trained on, and its files."""
     card = card_of(model)
-    about = "" if card is None else f"; learnt from {card.native_size[0]}x{card.native_size[1]} pixels"
+    about = "" if card is None else f"; trained at {card.native_size[0]}x{card.native_size[1]} pixels"
     if card is not None and card.native_focal_px is not None:
         about += f" of focal length {card.native_focal_px:.0f} px"
     lines = [f"{model.name}: {model.kind.value}{about}"]
@@ -106,7 +107,7 @@ def model_lines(model: DepthModel) -> list[str]:
 
 
 def judgement_lines(judgement: DepthJudgement) -> list[str]:
-    """What the table does not hold, one sentence each."""
+    """What :func:`judgement_table` does not show, one sentence each."""
     lines = [
         f"spread of the scale a frame (std of log): {with_half(judgement.scale_spread)}; "
         f"one median: × {judgement.sequence_factor:.3f}; affine: in {judgement.fitted_in}",
@@ -122,7 +123,7 @@ def judgement_lines(judgement: DepthJudgement) -> list[str]:
 
 
 def write_sheet(path: Path, rows: Sequence[SheetRow], scaled: str, title: str) -> None:
-    """Image, sensor depth, predicted depth and its relative error, a row a frame, as PNG.
+    """Write image, sensor depth, predicted depth and relative error of each frame, a row each, as PNG.
 
     Args:
         scaled: how ``predicted_m`` was scaled, for the heading, such as "after each frame's median".
@@ -162,9 +163,9 @@ def write_sheet(path: Path, rows: Sequence[SheetRow], scaled: str, title: str) -
 
 
 def write_over_depth(path: Path, judgements: Mapping[str, DepthJudgement], title: str) -> None:
-    """AbsRel and bias over the sensor's depth, a colour a data set, as PNG.
+    """Plot AbsRel and bias over the sensor's depth, a colour for each data set, as PNG.
 
-    Depths at which a data set has hardly a pixel are left out.
+    Depths with less than a thousandth of a data set's pixels are left out.
 
     Raises:
         OutputError: the file cannot be written.

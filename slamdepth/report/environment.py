@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run ran on and with: versions and hardware, but no names of hosts, users or folders."""
+"""Versions and hardware of a run, without names of hosts, users or folders."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _memory_gib() -> float | None:
 
 
 def _gpu() -> str | None:
-    """Asks only a torch that the run has loaded already: loading it takes seconds."""
+    """The GPU that torch sees, where it is loaded already: loading it takes seconds."""
     torch = sys.modules.get("torch")
     if torch is None or not torch.cuda.is_available():
         return None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures as PNG, or as inline SVG whose colours follow the page, so that they suit light and dark.
+"""Figures as PNG, or as inline SVG in the colours of the page, light or dark.
 
-Matplotlib's object-oriented API alone is used: no pyplot, no global figure state. Colours of
-SVG are drawn as placeholders and exchanged for CSS variables in the finished file.
+Only matplotlib's object-oriented API is used: no pyplot, no global figure state. SVG is drawn in placeholder
+colours, which are replaced by CSS variables in the finished file.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _STYLE = {
 
 
 def styled(name: str) -> Any:
-    """Context in which a figure is drawn and turned to SVG; ``name`` makes its ids its own."""
+    """Context in which a figure is drawn and turned into SVG; ``name`` makes its ids unique."""
     import matplotlib
 
     return matplotlib.rc_context({**_STYLE, "svg.hashsalt": name})
@@ -81,7 +81,7 @@ def new_figure(
 
 
 def legend_above(axes: Any, columns: int = 4, handles: Iterable[Any] | None = None) -> None:
-    """A one-line legend over the right end of ``axes``, where no curve can run through it."""
+    """A one-line legend above the right end of ``axes``, where no curve crosses it."""
     options = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": columns, "borderpad": 0.1}
     if handles is None:
         axes.legend(**options)
@@ -90,7 +90,7 @@ def legend_above(axes: Any, columns: int = 4, handles: Iterable[Any] | None = No
 
 
 def to_png(figure: Any, dpi: int = 120) -> bytes:
-    """The figure as a PNG file, which does not name the matplotlib that drew it."""
+    """The figure as a PNG file, without the version of matplotlib in it."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
     return buffer.getvalue()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a path pauses, so that no line bridges lost frames."""
+"""Pauses of a path: plots break lines there, where frames were lost."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ if TYPE_CHECKING:
 
 
 def gap_ends(timestamps_s: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices before which a curve must be broken: pauses of over 2.5 times the usual spacing."""
+    """Indices before which a curve must be broken: pauses longer than 2.5 times the median spacing."""
     spacing = np.diff(timestamps_s)
     return np.flatnonzero(spacing > 2.5 * np.median(spacing)) + 1 if len(spacing) else np.empty(0, np.int64)

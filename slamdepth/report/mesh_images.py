@@ -106,7 +106,7 @@ def _with_path(
 
     px, _ = project(camera, transform(invert(T_world_camera), trajectory.T_world_camera[:, :3, 3]))
     px = np.round(np.clip(px, -1e4, 1e4) * 2**_SUBPIXELS).astype(np.int32)
-    drawn = image_rgb.copy()
+    drawn: NDArray[np.uint8] = image_rgb.copy()
     parts = [part[:, None] for part in np.split(px, gap_ends(trajectory.timestamps_s)) if len(part) > 1]
     for colour, width in ((_CASING, 5), (_PATH, 2)):
         cv2.polylines(drawn, parts, False, colour, width, cv2.LINE_AA, _SUBPIXELS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plots of a report, each an inline SVG or None where its data are missing."""
+"""The plots of a report: each an inline SVG, or None where its data are missing."""
 
 from __future__ import annotations
 
@@ -82,20 +82,20 @@ def map_plot(run: Reconstruction) -> str | None:
     near = cloud[np.all((cloud >= low) & (cloud <= high), axis=1)]
     path = run.trajectory.T_world_camera[:, :3, 3]
     broken = _with_gaps(run.trajectory.timestamps_s, path)
-    places = np.array([keyframe.T_world_camera[:3, 3] for keyframe in run.keyframes]).reshape(-1, 3)
+    positions = np.array([keyframe.T_world_camera[:3, 3] for keyframe in run.keyframes]).reshape(-1, 3)
     views = drawing_views(run.gravity_w)
     with fig.styled("map"):
         figure, axes = fig.new_figure(_WIDTH, 4.4, 1, 2)
         for panel, view in zip(axes[0], views, strict=True):
             panel.plot(*view.flat(cloud).T, ".", color=_CLOUD, ms=2.2, alpha=0.6, mew=0, rasterized=True)
             panel.plot(*view.flat(broken).T, color=fig.ESTIMATE)
-            panel.plot(*view.flat(places).T, "o", color=fig.ESTIMATE, ms=2.2)
+            panel.plot(*view.flat(positions).T, "o", color=fig.ESTIMATE, ms=2.2)
             _frame(panel, view, view.flat(np.concatenate([near, path])))
         return fig.to_svg(figure, f"Sparse map: {views[0].title}, {views[1].title}")
 
 
 def tracking_plot(steps: tuple[StepResult, ...]) -> str | None:
-    """State of each frame as a strip, keyframes as ticks, and the map points each pose rests on."""
+    """State of each frame as a strip, keyframes as ticks, and the inliers of each pose."""
     if not steps:
         return None
     from matplotlib.patches import Patch
@@ -190,7 +190,7 @@ def position_plot(run: Reconstruction, score: TrajectoryScore | None) -> str | N
 
 
 def scale_plot(keyframes: tuple[Keyframe, ...]) -> str | None:
-    """The factor that turned each keyframe's predicted depth into metres of the map."""
+    """The factor that turned each keyframe's predicted depth into metres of the map, over time."""
     scales = np.array([keyframe.depth_scale for keyframe in keyframes if not keyframe.prediction.is_sensor])
     times = [k.frame.timestamp_s for k in keyframes if not k.prediction.is_sensor]
     good = np.isfinite(scales) & (scales > 0)
@@ -212,7 +212,7 @@ def _with_gaps(times: Floats, values: Floats) -> Floats:
 
 
 def _gap_times(times: Floats, start_s: float | None = None) -> Floats:
-    """Seconds since ``start_s`` that belong to the rows of :func:`_with_gaps`."""
+    """Seconds since ``start_s`` (default: the first time) for the rows of :func:`_with_gaps`."""
     seconds = times - (times[0] if start_s is None else start_s)
     return np.insert(seconds, gap_ends(times), np.nan)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which scale a map has, and how it was found."""
+"""The scale of a map, and where it comes from."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class ScaleSource(str, Enum):
-    """Where the unit of length comes from."""
+    """Where the scale of a map comes from."""
 
     SENSOR = "sensor"
     NETWORK = "network"
@@ -23,7 +23,14 @@ class ScaleSource(str, Enum):
 
 @dataclass(frozen=True)
 class ScalePart:
-    """One of several estimates that were combined: its factor, deviation of the log, weight."""
+    """One of several estimates that were combined.
+
+    Attributes:
+        source: where it comes from.
+        factor: on the depth model's own lengths.
+        uncertainty_log: standard deviation of the natural log of ``factor``.
+        weight: its share in the combination, 0 to 1.
+    """
 
     source: ScaleSource
     factor: float
@@ -36,16 +43,15 @@ class ScaleFacts:
     """The scale of a run.
 
     Attributes:
-        source: where it comes from; of several, the one that weighs most.
-        factor: on the depth model's own lengths, all in all. Of a relative model, which has
-            none, the factor on its numbers.
+        source: where it comes from; of several estimates, the one with the largest weight.
+        factor: total factor on the depth model's own lengths; of a relative model, on its numbers.
         sentence: all of this for people.
-        uncertainty_log: standard deviation of the natural log of the factor, known or
-            assumed (the sentence says which); None where nobody can say.
-        keyframes: that voted on the map's scale.
+        uncertainty_log: standard deviation of the natural log of ``factor``, measured or assumed
+            (``sentence`` says which); None where it is unknown.
+        keyframes: number of keyframes that voted on the map's scale.
         spread: standard deviation of their votes (log ratios of map to predicted depth).
-        prediction_factor: the part of ``factor`` that predictions were multiplied by as they
-            came; the rest was a factor on the finished map.
+        prediction_factor: the part of ``factor`` that was applied to predictions; the rest was applied to
+            the finished map.
         shift, shift_unit: added to the model's numbers after ``prediction_factor``, else None.
         from_ground_truth: True where the scale was taken from what the run is scored by.
         parts: the estimates that were combined, where there were several.
@@ -64,7 +70,7 @@ class ScaleFacts:
     parts: tuple[ScalePart, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """As nested plain values."""
+        """The facts as nested plain values, for ``report.json``."""
         values = asdict(self)
         values["source"] = self.source.value
         values["parts"] = [{**asdict(part), "source": part.source.value} for part in self.parts]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report says of the camera's shutter."""
+"""What a report says about the camera's shutter."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from slamdepth.types import RunStatistics
 
 
 def shutter_facts(run: RunStatistics, is_given: bool) -> dict[str, Any]:
-    """Readout time and its deviation in milliseconds, whether it was found out, and a sentence."""
+    """Readout time and its standard deviation in milliseconds, whether it was estimated, and a sentence."""
     if run.readout_s is None:
         return {
             "readout_ms": None,
             "uncertainty_ms": None,
             "is_found": False,
-            "sentence": "plays no part in this odometry",
+            "sentence": "not modelled by this odometry",
         }
     readout_ms = 1e3 * run.readout_s
     sigma_ms = None if run.readout_sigma_s is None else 1e3 * run.readout_sigma_s
@@ -31,7 +31,7 @@ def _sentence(readout_ms: float, sigma_ms: float | None, is_given: bool) -> str:
     if is_given:
         return f"{readout_ms:.1f} ms from first row to last, as given" if readout_ms else "global, as given"
     if sigma_ms is None:
-        return "taken for global: too little motion to find out"
+        return "assumed to be global: too little motion to estimate it"
     if readout_ms == 0.0:
-        return f"global: no readout time found beyond {sigma_ms:.1f} ms of doubt"
-    return f"{readout_ms:.1f} ± {sigma_ms:.1f} ms from first row to last, found from the motion"
+        return f"global: no readout time found, with an uncertainty of {sigma_ms:.1f} ms"
+    return f"{readout_ms:.1f} ± {sigma_ms:.1f} ms from first row to last, estimated from the motion"

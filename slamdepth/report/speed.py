@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the time of a run went."""
+"""The time that each stage of a run took."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from slamdepth.report.text import fixed, percent
 
 _NAMES = {
     "decode": "reading images",
-    "features": "finding features",
-    "tracking": "placing frames",
+    "features": "extracting features",
+    "tracking": "tracking frames",
     "depth": "depth of keyframes",
-    "mapping": "new map points",
-    "bundle": "adjusting the map near by",
-    "loops": "closing loops",
-    "finish": "the end of the run",
-    "final": "the end: adjusting all",
+    "mapping": "creating landmarks",
+    "bundle": "local bundle adjustment",
+    "loops": "loop closure",
+    "finish": "finishing the run",
+    "final": "global bundle adjustment",
 }
-_BESIDE = ("decode", "features", "final")
+_OVERLAPPING = ("decode", "features", "final")
 _WIDTH = 9.6
 
 
@@ -30,18 +30,21 @@ class StageTime:
 
     Attributes:
         name: for people.
-        is_beside: measured in another thread, or within another stage: adds nothing to the run.
+        seconds: in all.
+        calls: how often it was called.
         share: of the run's wall time, or None where that is unknown.
+        is_overlapping: True where it ran in parallel in another thread, or within another stage, so that
+            it adds nothing to the wall time.
     """
 
     name: str
     seconds: float
     calls: int
     share: float | None
-    is_beside: bool
+    is_overlapping: bool
 
     @property
-    def told(self) -> str:
+    def label(self) -> str:
         """Seconds, share, calls and milliseconds per call in one line."""
         times = (
             "once" if self.calls == 1 else f"{self.calls} × {fixed(1e3 * self.seconds / self.calls, 1, 'ms')}"
@@ -67,23 +70,23 @@ def stage_times(
             seconds = 1e-3 * ms * calls
             name = _NAMES.get(stage, stage.replace("_", " "))
             times.append(
-                StageTime(name, seconds, calls, seconds / wall_s if wall_s else None, stage in _BESIDE)
+                StageTime(name, seconds, calls, seconds / wall_s if wall_s else None, stage in _OVERLAPPING)
             )
     return sorted(times, key=lambda time: (-time.seconds, time.name))
 
 
 def speed_plot(times: list[StageTime]) -> str | None:
-    """Seconds of each stage as bars, those that add nothing to the run in grey; None without any."""
+    """Seconds of each stage as bars, overlapping stages in grey; None without any stage."""
     if not times:
         return None
     with fig.styled("timings"):
         figure, axes = fig.new_figure(_WIDTH, 0.5 + 0.26 * len(times))
         panel = axes[0, 0]
         seconds = [time.seconds for time in times]
-        colours = [fig.MUTED if time.is_beside else fig.ESTIMATE for time in times]
+        colours = [fig.MUTED if time.is_overlapping else fig.ESTIMATE for time in times]
         bars = panel.barh(range(len(times)), seconds, 0.62, color=colours)
         panel.set_yticks(range(len(times)), [time.name for time in times])
-        panel.bar_label(bars, labels=[time.told for time in times], padding=4, color=fig.INK)
+        panel.bar_label(bars, labels=[time.label for time in times], padding=4, color=fig.INK)
         panel.set(xlabel="seconds in all", xlim=(0, 1.45 * max(seconds) or 1.0))
         panel.invert_yaxis()
         panel.grid(False, axis="y")
@@ -93,13 +96,13 @@ def speed_plot(times: list[StageTime]) -> str | None:
 
 
 def speed_caption(wall_s: float | None) -> str:
-    """What the bars of :func:`speed_plot` are, and what each stage does."""
+    """The caption of :func:`speed_plot`: what the bars are, and what each stage does."""
     of = "" if wall_s is None else f", share of the {wall_s:.1f} s from the first frame to the last result"
     return (
-        f"Seconds in all{of}, and calls × time of a call. Depth of keyframes: the prediction or, where a "
-        "thread of its own makes it, the wait for it. Adjusting the map near by: bundle adjustment of the "
-        "newest keyframes, begun and taken over. The end of the run: bundle adjustment of the whole map, its "
-        "scale, and every frame placed once more. Grey adds nothing to the whole: a thread that works ahead "
-        "reads images and finds features, and adjusting all is part of the end. What is missing to 100 % is "
-        "waiting for images and bookkeeping."
+        f"Seconds in all{of}, and calls × time per call. Depth of keyframes: the prediction or, where it is "
+        "made in a thread of its own, the wait for it. Local bundle adjustment: starting it for the newest "
+        "keyframes and applying its result. Finishing the run: global bundle adjustment, scale, and the "
+        "final pose of every frame. Grey adds nothing to the total: another thread reads images and extracts "
+        "features ahead, and global bundle adjustment is part of finishing. The rest to 100 % is waiting for "
+        "images and bookkeeping."
     )

@@ -13,7 +13,7 @@ from slamdepth.report.shutter import shutter_facts
 
 
 def build_summary(data: ReportData) -> dict[str, Any]:
-    """Every key is always there; what could not be measured is None."""
+    """The figures of a run, as nested plain values. Every key is always there; unknown values are None."""
     run, statistics = data.reconstruction, data.reconstruction.statistics
     return {
         "sequence": data.sequence,

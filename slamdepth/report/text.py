@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How figures are written for people: the same in the console and in the HTML."""
+"""How figures are written for people, in the console and in the HTML."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ MISSING = "–"
 
 
 def count(value: int | None) -> str:
-    """A whole number, its thousands set apart by narrow blanks that do not break."""
+    """A whole number, its thousands separated by narrow no-break spaces."""
     return MISSING if value is None else f"{value:,}".replace(",", "\u202f")
 
 
 def fixed(value: float | None, digits: int, unit: str = "") -> str:
-    """``value`` with so many digits after the point, and its unit."""
+    """``value`` with ``digits`` digits after the point, and its unit."""
     return MISSING if value is None else f"{value:.{digits}f}{f' {unit}' if unit else ''}"
 
 

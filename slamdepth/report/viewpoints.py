@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From where a mesh is best looked at, found from the mesh and the path of the camera."""
+"""Viewpoints for images of a mesh, chosen from the mesh and the path of the camera."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ def ideal_camera(width: int, height: int, across_deg: float) -> Camera:
 
 
 def guessed_gravity(T_world_camera: Floats) -> Floats:
-    """Direction of gravity ``(3,)`` in the world, as if the cameras ``(N, 4, 4)`` were held level.
+    """Direction of gravity ``(3,)`` in the world, assuming that the cameras ``(N, 4, 4)`` were held level.
 
-    The x axis of a level camera is level, however it is turned and tipped (Brown and Lowe, "Automatic
-    panoramic image stitching using invariant features", IJCV 2007). Where the axes lie in no plane, or in
-    many, it is the mean of the y axes, and without that the first camera's.
+    The x axes of level cameras lie in a level plane, however the cameras are turned and tipped (Brown and
+    Lowe, "Automatic panoramic image stitching using invariant features", IJCV 2007). Where the axes define
+    no plane, the result is the mean of the y axes; where that vanishes, the first camera's y axis.
     """
     x, y = T_world_camera[:, :3, 0], T_world_camera[:, :3, 1].mean(axis=0)
     if np.linalg.norm(y) < 0.1:
@@ -56,7 +56,7 @@ def guessed_gravity(T_world_camera: Floats) -> Floats:
 def from_above(mesh: Mesh, path_w: Floats, gravity_w: Floats, camera: Camera) -> Floats:
     """``T_world_camera (4, 4)`` obliquely from above, from the side that shows most of the mesh's front.
 
-    That is behind the camera which saw it. All of mesh and path is in the image, except for strays.
+    That side is behind the camera which saw it. All of mesh and path is in the image, except for strays.
 
     Args:
         path_w: ``(N, 3)`` positions of the camera in the world.
@@ -72,10 +72,14 @@ def from_above(mesh: Mesh, path_w: Floats, gravity_w: Floats, camera: Camera) ->
 
 
 def over_the_shoulder(mesh: Mesh, T_world_camera: Floats, gravity_w: Floats, camera: Camera) -> Floats | None:
-    """``T_world_camera (4, 4)`` a step behind that pose ``(N, 4, 4)`` of the path from which most of the
-    mesh's front is seen; None where each looks straight down or up, or at nothing.
+    """``T_world_camera (4, 4)``, level, a step behind the pose that sees most of the mesh's front.
 
-    The image is level, whatever the pose was.
+    Args:
+        T_world_camera: ``(N, 4, 4)`` poses of the path to choose from.
+        gravity_w: ``(3,)`` unit direction of gravity in the world.
+
+    Returns:
+        None where every pose looks straight down or up, or at nothing.
     """
     corner, normals = _triangles(mesh)
     best, most = None, 0.0
@@ -99,7 +103,7 @@ def over_the_shoulder(mesh: Mesh, T_world_camera: Floats, gravity_w: Floats, cam
 
 
 def _triangles(mesh: Mesh) -> tuple[Floats, Floats]:
-    """A corner ``(N, 3)`` of some triangles, and their normals as long as twice their area."""
+    """A corner ``(N, 3)`` of some triangles, and their normals, of twice their area in length."""
     some = mesh.triangles[:: -(-len(mesh.triangles) // _MOST)]
     a, b, c = (mesh.vertices_m[some[:, k]].astype(np.float64) for k in range(3))
     return a, np.cross(b - a, c - a)
@@ -113,8 +117,8 @@ def _inside(points: Floats, T_world_camera: Floats, camera: Camera) -> NDArray[n
 
 
 def _fitted(points: Floats, path_w: Floats, T_world_camera: Floats, camera: Camera) -> Floats:
-    """The camera moved, not turned, to where it has both in the image, as near as that allows."""
-    T = T_world_camera.copy()
+    """The camera moved, not turned, as near as possible with both in the image."""
+    T: Floats = T_world_camera.copy()
     p, path = points @ T[:3, :3], path_w @ T[:3, :3]
     half = np.array([camera.width / camera.fx, camera.height / camera.fy]) / 2 * _MARGIN
     # a point is left of the right edge of a camera at (x, z) where p_x - half p_z < x - half z

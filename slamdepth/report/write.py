@@ -15,7 +15,7 @@ from slamdepth.report.summary import build_summary
 def write_report(run_folder: str | Path, data: ReportData) -> dict[str, Any]:
     """Write ``report.json`` and ``report.html`` into ``run_folder``, each whole or not at all.
 
-    The figures are on disk before the page is drawn.
+    The figures are written before the page is drawn.
 
     Returns:
         The content of ``report.json``.
