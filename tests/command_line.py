@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calling the command line from tests, and sequences with something wrong about them."""
+"""Calling the command line from tests, and copies of sequences to be damaged."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ENVIRONMENT = {
 
 
 class Finished(NamedTuple):
-    """What a command left behind."""
+    """Exit code and output of a command."""
 
     returncode: int
     stdout: str
@@ -42,7 +42,10 @@ def slamdepth(*arguments: object, **environment: str) -> subprocess.CompletedPro
 
 
 def call(*arguments: object) -> Finished:
-    """Run ``slamdepth`` in this process, which spares its start; the environment is this one's."""
+    """Run ``slamdepth`` in this process, which saves the seconds of its imports.
+
+    Environment, logging and ``sys.argv`` are afterwards as they were.
+    """
     package = logging.getLogger("slamdepth")
     before = sys.argv, dict(os.environ), package.level, list(package.handlers)
     stdout, stderr = io.StringIO(), io.StringIO()
@@ -86,7 +89,7 @@ def replace_image(path: Path, data: bytes) -> None:
 
 
 def make_long(sequence: Path, folder: Path, repeats: int) -> Path:
-    """The sequence played forth and back: long enough to be interrupted whatever the machine."""
+    """The sequence played forward and back ``repeats`` times: long enough to be interrupted."""
     copy_of(sequence, folder)
     (folder / "groundtruth.txt").unlink()
     for kind in ("rgb", "depth"):

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import call, copy_of, images, replace_image, slamdepth
+from command_line import call, copy_of, images, replace_image
 
 RUN = ("run", "SEQ", "--depth", "sensor", "--output", "OUT")
 
@@ -202,22 +202,20 @@ def test_bad_calls(case: str, tiny_room: Path, tmp_path: Path) -> None:
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_predicted_depth_without_weights_says_how_to_get_them(tiny_room: Path, tmp_path: Path) -> None:
-    done = slamdepth(
-        "run",
-        tiny_room,
-        "--depth",
-        "dinov2",
-        "--output",
-        tmp_path / "out",
-        SLAMDEPTH_CACHE=str(tmp_path / "empty"),
-    )
+def test_predicted_depth_without_weights_says_how_to_get_them(
+    tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SLAMDEPTH_CACHE", str(tmp_path / "empty"))
+    done = call("run", tiny_room, "--depth", "dinov2", "--output", tmp_path / "out")
     assert done.returncode == 2
     assert_one_line(done.stderr, "slamdepth weights pull")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_traceback_is_shown_only_when_asked() -> None:
-    assert "Traceback" not in slamdepth("run", "/no/such/folder").stderr
-    assert "Traceback" in slamdepth("run", "/no/such/folder", "--verbose").stderr
-    assert "Traceback" in slamdepth("run", "/no/such/folder", SLAMDEPTH_DEBUG="1").stderr
+def test_a_traceback_is_shown_only_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SLAMDEPTH_DEBUG", raising=False)
+    assert "Traceback" not in call("run", "/no/such/folder").stderr
+    assert "Traceback" in call("run", "/no/such/folder", "--verbose").stderr
+    assert "Traceback" not in call("run", "/no/such/folder").stderr
+    monkeypatch.setenv("SLAMDEPTH_DEBUG", "1")
+    assert "Traceback" in call("run", "/no/such/folder").stderr

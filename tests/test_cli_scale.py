@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``slamdepth scale`` and the scale options of ``slamdepth run``, on a tiny rendered room."""
+"""``slamdepth scale`` and the scale options of ``slamdepth run``, on a small rendered room."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from slamdepth.depth import registry
 from slamdepth.depth.scale_file import read_scale
 from slamdepth.io import read_tum_trajectory
 from slamdepth.types import DepthKind, WeightsInfo
+
+SHORT = ("--max-frames", 20, "--no-mesh", "--quiet")
 
 
 @pytest.fixture(autouse=True)
@@ -46,7 +48,7 @@ def without_depth(tiny_room: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def run(room: Path, folder: Path, *arguments: object) -> dict[str, Any]:
-    done = call("run", room, "--depth", "flat", "--no-mesh", "--quiet", "--output", folder, *arguments)
+    done = call("run", room, "--depth", "flat", *SHORT, "--output", folder, *arguments)
     assert done.returncode == 0, done.stderr
     report: dict[str, Any] = json.loads((folder / "report.json").read_text())
     assert report["scale"]["sentence"].split()[0] in done.stdout
@@ -70,9 +72,7 @@ def test_a_scale_is_fitted_kept_and_applied(tiny_room: Path, tmp_path: Path) -> 
     assert "SE(3) ATE is not a metric claim" in scale["sentence"]
     assert report["settings"]["scale"]["depth"] == "scale.yaml"
     again = tmp_path / "again"
-    done = call(
-        "run", tiny_room, "--config", tmp_path / "one" / "config.yaml", "--no-mesh", "-q", "-o", again
-    )
+    done = call("run", tiny_room, "--config", tmp_path / "one" / "config.yaml", *SHORT, "-o", again)
     assert done.returncode == 0, done.stderr
     assert (again / "trajectory.txt").read_bytes() == (tmp_path / "one" / "trajectory.txt").read_bytes()
 
@@ -81,7 +81,7 @@ def test_a_scale_is_fitted_kept_and_applied(tiny_room: Path, tmp_path: Path) -> 
     assert "was fitted with other weights of 'flat'" in other.stderr
 
 
-def test_a_broken_off_fit_says_that_nothing_is_kept(
+def test_an_interrupted_fit_says_that_nothing_is_kept(
     tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(model: ConstantDepth, frame: object) -> None:
@@ -102,7 +102,7 @@ def test_a_scale_of_an_earlier_call_is_replaced(tiny_room: Path, tmp_path: Path)
 
 
 def test_ground_truth_depth_is_fitted_first(tiny_room: Path, tmp_path: Path) -> None:
-    report = run(tiny_room, tmp_path / "run", "--depth-scale", "groundtruth")
+    report = run(tiny_room, tmp_path / "run", "--max-frames", 40, "--depth-scale", "groundtruth")
     assert report["scale"]["source"] == "groundtruth-depth"
     fitted = read_scale(tmp_path / "run" / "depth_scale.yaml").scale.scale
     assert fitted == report["scale"]["prediction_factor"]
@@ -122,24 +122,24 @@ def test_without_sensor_the_ground_truth_trajectory_gives_the_scale(
 
 
 def test_a_number_and_a_known_baseline(tiny_room: Path, tmp_path: Path) -> None:
-    plain = run(tiny_room, tmp_path / "plain")
+    given = run(tiny_room, tmp_path / "given")
     half = run(tiny_room, tmp_path / "half", "--depth-scale", 0.5)
     assert half["scale"]["source"] == "value"
-    ratio = half["ate"]["sim3"]["scale"] / plain["ate"]["sim3"]["scale"]
+    ratio = half["ate"]["sim3"]["scale"] / given["ate"]["sim3"]["scale"]
     assert ratio == pytest.approx(2.0, rel=0.02)
 
     from slamdepth.datasets import open_dataset
 
     truth = open_dataset(tiny_room).ground_truth
     assert truth is not None
-    times, places = truth.timestamps_s, truth.T_world_camera[:, :3, 3]
-    length_m = float(((places[30] - places[0]) ** 2).sum() ** 0.5)
-    between = ("--baseline-between", times[0], times[30])
+    times, positions = truth.timestamps_s, truth.T_world_camera[:, :3, 3]
+    length_m = float(((positions[19] - positions[0]) ** 2).sum() ** 0.5)
+    between = ("--baseline-between", times[0], times[19])
     known = run(tiny_room, tmp_path / "known", "--baseline-m", length_m, *between)
     assert known["scale"]["source"] == "baseline"
     found, _ = read_tum_trajectory(tmp_path / "known" / "trajectory.txt")
-    places = found.T_world_camera[:, :3, 3]
-    assert ((places[30] - places[0]) ** 2).sum() ** 0.5 == pytest.approx(length_m, rel=0.05)
+    positions = found.T_world_camera[:, :3, 3]
+    assert ((positions[19] - positions[0]) ** 2).sum() ** 0.5 == pytest.approx(length_m, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_stride_limit_and_pairs_without_depth(tmp_path: Path) -> None:
     assert one["pairs"] == one["images"] == 3
 
 
-def test_two_of_a_name_are_told_apart(tmp_path: Path) -> None:
+def test_two_of_one_name_are_distinguished(tmp_path: Path) -> None:
     data = [place(tmp_path / a / "desk", [500]) for a in ("one", "two")]
     assert [one["name"] for one in data_statistics(data)["sets"]] == ["one/desk", "two/desk"]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package's front: its names, and what importing it costs."""
+"""The package: its public names, and what importing it costs."""
 
 from __future__ import annotations
 
@@ -91,6 +91,7 @@ def test_only_the_command_line_prints() -> None:
 
 
 def test_every_file_names_its_licence() -> None:
-    for path in Path(slamdepth.__file__).parent.rglob("*.py"):
-        first = path.read_text(encoding="utf-8").partition("\n")[0]
-        assert first == "# SPDX-License-Identifier: Apache-2.0", path
+    for ending, comment in (("py", "# {}"), ("j2", "{{#- {} -#}}")):
+        for path in Path(slamdepth.__file__).parent.rglob(f"*.{ending}"):
+            first = path.read_text(encoding="utf-8").partition("\n")[0]
+            assert first == comment.format("SPDX-License-Identifier: Apache-2.0"), path
