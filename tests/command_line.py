@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections import defaultdict
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import NamedTuple
@@ -58,6 +59,11 @@ def call(*arguments: object) -> Finished:
         os.environ.clear()
         os.environ.update(environment)
     return Finished(int(leaving.value.code or 0), stdout.getvalue(), stderr.getvalue())
+
+
+def leave_out_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw no plots in reports of this process: they take most of a short run's time."""
+    monkeypatch.setattr("slamdepth.report.html._charts", lambda data, summary: defaultdict(lambda: None))
 
 
 def command(*arguments: object) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import call, copy_of, images, replace_image, slamdepth
+from command_line import call, copy_of, images, leave_out_plots, replace_image, slamdepth
 
 from slamdepth.cli.console import console, print_places
 from slamdepth.io import read_tum_trajectory
@@ -26,7 +26,8 @@ RUN = ("run", "--depth", "sensor", "--max-frames", FRAMES)
 
 
 @pytest.fixture(autouse=True)
-def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def wide_terminal_and_no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_out_plots(monkeypatch)
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setenv("NO_COLOR", "1")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import call, copy_of
+from command_line import call, copy_of, leave_out_plots
 from tracking_scene import ConstantDepth
 
 from slamdepth.depth import registry
@@ -22,7 +22,8 @@ SHORT = ("--max-frames", 20, "--no-mesh", "--quiet")
 
 @pytest.fixture(autouse=True)
 def flat(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A depth model called ``flat``, which takes a weights file, and a relative one."""
+    """Depth models: ``flat``, which takes a weights file, and a relative one; reports without plots."""
+    leave_out_plots(monkeypatch)
     monkeypatch.setattr(registry.MODELS, "parts", dict(registry.MODELS.parts))
 
     @registry.register("flat")

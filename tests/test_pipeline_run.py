@@ -8,12 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import copy_of
+from command_line import copy_of, leave_out_plots
 
 from slamdepth.config import Config
 from slamdepth.errors import ConfigError, DatasetError, OutputError
 from slamdepth.io import read_tum_trajectory
 from slamdepth.pipeline import RunInterrupted, RunProgress, RunStage, run
+
+
+@pytest.fixture(autouse=True)
+def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_out_plots(monkeypatch)
 
 
 def test_a_run_returns_what_it_wrote_and_prints_nothing(
