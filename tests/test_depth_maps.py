@@ -1,85 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth maps in files: what is written, what it says of itself, and going on after a stop."""
+"""Depth maps in files: what is written, and what the files say about it."""
 
 from __future__ import annotations
 
 import json
-import re
-import signal
-import subprocess
-import threading
-import time
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from command_line import ENVIRONMENT, call, command, make_long
+from command_line import call
+from depth_map_models import INVERSE, METRIC, files, make, photos, register_ramps, video
 from sequences import CAMERA, image_rgb, make_tum, write_image
 
 from slamdepth.datasets import write_camera
-from slamdepth.depth import registry
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import ConfigError, DatasetError, InputError, OutputError
-from slamdepth.pipeline.depth_maps import DepthMapOptions, DepthMapsInterrupted, make_depth_maps
+from slamdepth.pipeline.depth_maps import DepthMapOptions, make_depth_maps
 from slamdepth.pipeline.depth_maps.about import public_name
 from slamdepth.report.depth_map import coloured
-from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
-
-SEEN: list[int] = []
-
-
-class Ramp:
-    """Depth from 1 m at the left to 3 m at the right, 70 m in one corner; counts its calls."""
-
-    def __init__(self, name: str, kind: DepthKind) -> None:
-        self.name, self.kind = name, kind
-        self.weights = (WeightsInfo(f"{name}-weights", "ab" * 32, "nothing", "none"),)
-
-    def predict(self, frame: Frame) -> DepthPrediction:
-        SEEN.append(frame.index)
-        height, width = frame.image_rgb.shape[:2]
-        values = np.tile(np.linspace(1.0, 3.0, width, dtype=np.float32), (height, 1))
-        values[0, 0] = 70.0
-        values[0, 1] = 0.0
-        return DepthPrediction(values, self.kind)
+from slamdepth.types import DepthKind
 
 
 @pytest.fixture(autouse=True)
 def models(monkeypatch: pytest.MonkeyPatch) -> None:
-    SEEN.clear()
-    for kind in DepthKind:
-        name = f"ramp {kind.value}"
-        factory: Any = lambda *, device, seed, n=name, k=kind: Ramp(n, k)  # noqa: E731
-        monkeypatch.setitem(registry.MODELS.parts, name, factory)
-
-
-METRIC = f"ramp {DepthKind.METRIC.value}"
-INVERSE = f"ramp {DepthKind.AFFINE_INVERSE_DEPTH.value}"
-
-
-def make(source: Path, output: Path, depth: str = METRIC, **options: Any) -> dict[str, Any]:
-    return make_depth_maps(DepthMapOptions(source, output, depth, **options)).about
-
-
-def photos(folder: Path, count: int = 3, side: tuple[int, int] = (64, 48)) -> Path:
-    for i in range(count):
-        rng = np.random.default_rng(i)
-        write_image(folder / f"p{i + 8}.png", rng.integers(0, 256, (side[1], side[0], 3), dtype=np.uint8))
-    return folder
-
-
-def video(path: Path, count: int = 6) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (64, 48))
-    for i in range(count):
-        writer.write(np.full((48, 64, 3), 20 * i, np.uint8))
-    writer.release()
-    return path
-
-
-def files(folder: Path) -> set[str]:
-    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    register_ramps(monkeypatch)
 
 
 def points_of(path: Path) -> tuple[str, np.ndarray]:
@@ -212,81 +158,6 @@ def test_names_that_differ_in_the_ending_alone_stay_apart(tmp_path: Path) -> Non
     assert [json.loads(line)["name"] for line in lines] == ["A.JPG", "a.png", "b2", "b10"]
 
 
-def test_only_what_is_missing_is_predicted_again(tmp_path: Path) -> None:
-    folder, out = photos(tmp_path / "in", 4), tmp_path / "out"
-    make(folder, out)
-    before = {name: (out / name).read_bytes() for name in files(out)}
-    SEEN.clear()
-    make(folder, out)
-    assert SEEN == []
-    assert {name: (out / name).read_bytes() for name in files(out)} == before
-    (out / "cloud" / "p9.cloud.ply").unlink()
-    write_image(folder / "p10.png", image_rgb(7))
-    make(folder, out)
-    assert SEEN == [1, 2]
-    assert np.load(out / "depth-metres" / "p10.depth-metres.npy").shape == (12, 16)
-
-
-@pytest.mark.parametrize("after", [1, 4, 8])
-def test_a_stopped_video_goes_on_to_the_same_bytes(after: int, tmp_path: Path) -> None:
-    """Stopped while predicting, between the passes, and while drawing."""
-    source = video(tmp_path / "v.mp4")
-    make(source, tmp_path / "whole")
-    stop, calls = threading.Event(), []
-
-    def count(*state: object) -> None:
-        calls.append(state)
-        if len(calls) == after:
-            stop.set()
-
-    out = tmp_path / "out"
-    options = DepthMapOptions(source, out, METRIC)
-    with pytest.raises(DepthMapsInterrupted, match="the same command goes on") as stopped:
-        make_depth_maps(options, progress=count, stop=stop)
-    assert stopped.value.exit_code == 130
-    assert json.loads((out / "depth.json").read_text())["complete"] is False
-    done = min(after, 6)
-    with (out / "frames.jsonl").open("a") as journal:
-        journal.write('{"name": "frame-0000')  # as a kill leaves it
-    SEEN.clear()
-    assert make_depth_maps(options).about["complete"] is True
-    assert list(range(done, 6)) == SEEN
-    for name in files(tmp_path / "whole"):
-        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
-
-
-def test_more_frames_of_a_video_can_be_asked_for_later(tmp_path: Path) -> None:
-    source = video(tmp_path / "v.mp4")
-    make(source, tmp_path / "out", max_frames=2)
-    SEEN.clear()
-    assert make(source, tmp_path / "out")["video"]["frames"] == 6
-    assert SEEN == [2, 3, 4, 5]
-
-
-def test_other_settings_need_overwrite(tmp_path: Path) -> None:
-    folder, out = photos(tmp_path / "in"), tmp_path / "out"
-    make(folder, out)
-    (out / "mine.txt").write_text("kept")
-    with pytest.raises(ConfigError, match=r"made with 'point clouds' true, now false; .*--overwrite"):
-        make(folder, out, cloud=False)
-    with pytest.raises(ConfigError, match="made with 'depth model' ramp metric depth, now ramp affine inv"):
-        make(folder, out, INVERSE)
-    make(folder, out, INVERSE, overwrite=True)
-    assert not (out / "cloud").exists()
-    assert not list(out.rglob("*metres*"))
-    assert (out / "mine.txt").read_text() == "kept"
-
-
-def test_another_sequence_of_the_same_name_is_another(tmp_path: Path) -> None:
-    """All of 7-Scenes are called seq-NN."""
-    chess, fire = (tmp_path / scene / "seq-01" for scene in ("chess", "fire"))
-    out = tmp_path / "out"
-    make(make_tum(chess, 3), out, "sensor")
-    with pytest.raises(ConfigError, match=r"made with 'source' .*seq-01 \(.*now .*seq-01 \(.*--overwrite"):
-        make(make_tum(fire, 4), out, "sensor")
-    assert make(chess, out, "sensor")["frames"] == 3
-
-
 def test_a_fixed_range_colours_all_alike(tmp_path: Path) -> None:
     out = tmp_path / "out"
     make(photos(tmp_path / "in", 1), out, colour_range=(0.0, 10.0))
@@ -349,34 +220,6 @@ def test_bad_input_is_one_clear_error_and_leaves_nothing(tmp_path: Path) -> None
     assert len(list(foreign.iterdir())) == 3
 
 
-def test_a_full_disk_is_reported_after_the_first_image(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from types import SimpleNamespace
-
-    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1000))
-    with pytest.raises(OutputError, match="GB free; leave out the point clouds"):
-        make(photos(tmp_path / "in"), tmp_path / "out")
-    assert SEEN == [0]
-
-
-@pytest.mark.parametrize(
-    ("cloud", "said"), [(True, r"--no-cloud leaves out \d\d% of that"), (False, "--stride and --max-frames")]
-)
-def test_many_gigabytes_are_reported_after_the_first_image(
-    cloud: bool, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    source = photos(tmp_path / "in")
-    make(source, tmp_path / "small", cloud=cloud)
-    assert "GB" not in caplog.text
-    monkeypatch.setattr("slamdepth.pipeline.depth_maps.job._MUCH_BYTES", 1000)
-    about = make(source, tmp_path / "large", cloud=cloud)
-    (warning,) = [record.getMessage() for record in caplog.records if "GB" in record.getMessage()]
-    assert re.fullmatch(
-        rf"{about['frames'] - 1} images? still to do, about .* GB, .* GB free; {said}.*", warning
-    )
-
-
 def test_images_far_apart_are_shown_for_a_second_each(tmp_path: Path) -> None:
     make(video(tmp_path / "v.mp4", count=6), tmp_path / "out", stride=100_000)
     made = cv2.VideoCapture(str(tmp_path / "out" / "side-by-side.mp4"))
@@ -395,27 +238,6 @@ def test_the_command_says_what_it_made(tmp_path: Path, monkeypatch: pytest.Monke
     assert again.returncode == 2
     assert "made with 'stride' 1, now 2" in again.stderr
     assert again.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_is_one_line_and_code_130(number: signal.Signals, tiny_room: Path, tmp_path: Path) -> None:
-    room, out = make_long(tiny_room, tmp_path / "room", repeats=40), tmp_path / "out"
-    process = subprocess.Popen(
-        command("depth", room, "--depth", "sensor", "--output", out, "--no-cloud", "--quiet"),
-        env=ENVIRONMENT,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    journal = out / "frames.jsonl"
-    while process.poll() is None and not (journal.exists() and journal.read_text().count("\n") > 3):
-        time.sleep(0.01)
-    process.send_signal(number)
-    _, stderr = process.communicate(timeout=600)
-    assert process.returncode == 130, stderr
-    assert stderr.startswith("error: interrupted while predicting: ")
-    assert stderr.count("\n") == 1
-    done = [json.loads(line)["name"] for line in journal.read_text().splitlines()]
-    assert len(list((out / "depth-metres").glob("*.npy"))) == len(done) > 3
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_report import full_data
+from report_data import full_data
 
 from slamdepth.geometry import so3_exp
 from slamdepth.report import build_html, build_summary

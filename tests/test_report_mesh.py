@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_report import bare_data, full_data
+from report_data import bare_data, full_data
 
 from slamdepth.errors import OutputError
 from slamdepth.geometry import invert, project, so3_exp, transform

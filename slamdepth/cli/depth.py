@@ -61,8 +61,7 @@ def depth_command(
 
     Example: slamdepth depth holiday.mp4 --stride 5 --output holiday-depth
 
-    Metres need the focal length: from --camera, a camera.yaml in the folder of the images, a known sequence,
-    or EXIF.
+    Metres need the focal length: --camera, a camera.yaml next to the images, a known sequence, or EXIF.
 
     Otherwise it is guessed, and the results say so.
 
