@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import leave_out_plots
 from report_data import SCALE, bare_data, full_data
 from rich.console import Console
 
@@ -113,7 +114,8 @@ def test_summary_names_no_host_user_or_folder() -> None:
         assert getpass.getuser() not in text
 
 
-def test_write_report_writes_both_files(tmp_path: Path) -> None:
+def test_write_report_writes_both_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_out_plots(monkeypatch)
     summary = write_report(tmp_path, full_data())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "report.json"]
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8")) == summary
@@ -187,7 +189,8 @@ def test_figures_are_written_honestly() -> None:
     assert fixed(1.23456, 2, "m") == "1.23 m"
 
 
-def test_a_scale_from_ground_truth_is_no_metric_claim() -> None:
+def test_a_scale_from_ground_truth_is_no_metric_claim(monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_out_plots(monkeypatch)
     given = replace(
         SCALE, source=ScaleSource.GROUND_TRUTH_DEPTH, from_ground_truth=True, prediction_factor=1.2
     )

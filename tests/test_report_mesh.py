@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import leave_out_plots
 from report_data import bare_data, full_data
 
 from slamdepth.errors import OutputError
@@ -127,7 +128,10 @@ def test_the_path_is_broken_where_frames_were_lost() -> None:
     assert 0 < blue[1] < blue[0]
 
 
-def test_the_page_shows_them_and_the_file_has_them_side_by_side(tmp_path: Path) -> None:
+def test_the_page_shows_them_and_the_file_has_them_side_by_side(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_out_plots(monkeypatch)
     image = np.full((6, 9, 3), (200, 100, 50), np.uint8)
     images = (MeshImage("One <view>", "What & why.", image), MeshImage("Other", "Too.", image // 2))
     data = replace(full_data(), mesh_images=images)
@@ -145,7 +149,8 @@ def test_the_page_shows_them_and_the_file_has_them_side_by_side(tmp_path: Path) 
         write_mesh_png(tmp_path / "absent" / "mesh.png", images)
 
 
-def test_the_page_says_that_there_is_no_mesh() -> None:
+def test_the_page_says_that_there_is_no_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_out_plots(monkeypatch)
     page = build_html(bare_data(), build_summary(bare_data()))
     assert "no image of one" in page
     assert "no image of one" not in build_html(full_data(), build_summary(full_data()))
