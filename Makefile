@@ -18,7 +18,7 @@ demo: install
 	$(BIN)/slamdepth run demo/room --depth dinov2 --output demo/run --overwrite
 
 test: install-dev
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses auto --maxprocesses 4
 
 lint: install-dev
 	$(BIN)/ruff check .

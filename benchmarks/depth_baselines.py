@@ -25,6 +25,7 @@ from slamdepth.depth.dinov2_mlp import SIDE, Dinov2Mlp, MlpHead, at_size, load_m
 from slamdepth.depth.network import NetworkDepth
 from slamdepth.depth.preprocess import focal_px_at, resize_rgb
 from slamdepth.errors import WeightsError
+from slamdepth.io import sha256_of
 from slamdepth.training.mlp import MlpPairs, MlpSettings, cached_tokens, read_pairs, train_mlp
 from slamdepth.training.progress import Progress, silent
 from slamdepth.training.readers.pairs import PairPlace
@@ -95,7 +96,7 @@ class PixelMlp(NetworkDepth):
             WeightsError: the file is no such head.
         """
         head, about = load_mlp(file, features=_PIXELS)
-        info = WeightsInfo(file.stem, store.sha256_of(file), about["trained_on"], about["licence"])
+        info = WeightsInfo(file.stem, sha256_of(file), about["trained_on"], about["licence"])
         return cls(head, float(about["focal_px"]), (info,))
 
     def infer(self, image_rgb: NDArray[np.uint8]) -> tuple[Floats32, tuple[int, int]]:

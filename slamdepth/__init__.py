@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from slamdepth._version import __version__
 
 if TYPE_CHECKING:
     from slamdepth.config import Config
@@ -28,12 +28,15 @@ if TYPE_CHECKING:
         WeightsError,
     )
     from slamdepth.evaluation import score_trajectory
+    from slamdepth.frontend.preparation import Prepared
     from slamdepth.io import read_tum_trajectory, write_tum_trajectory
     from slamdepth.mapping.keyframe import Keyframe
     from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
     from slamdepth.mapping.mesh import Mesh
     from slamdepth.mapping.reconstruction import Reconstruction
-    from slamdepth.tracking import Tracker, create_tracker
+    from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage
+    from slamdepth.pipeline.run import run
+    from slamdepth.tracking import CloudTracker, Tracker, create_tracker
     from slamdepth.types import (
         Camera,
         DepthKind,
@@ -49,6 +52,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Camera": "slamdepth.types",
     "CameraError": "slamdepth.errors",
+    "CloudTracker": "slamdepth.tracking",
     "Config": "slamdepth.config",
     "ConfigError": "slamdepth.errors",
     "Dataset": "slamdepth.datasets",
@@ -62,7 +66,12 @@ _HOME = {
     "Keyframe": "slamdepth.mapping.keyframe",
     "Mesh": "slamdepth.mapping.mesh",
     "OutputError": "slamdepth.errors",
+    "Prepared": "slamdepth.frontend.preparation",
     "Reconstruction": "slamdepth.mapping.reconstruction",
+    "RunInterrupted": "slamdepth.pipeline",
+    "RunProgress": "slamdepth.pipeline",
+    "RunResult": "slamdepth.pipeline",
+    "RunStage": "slamdepth.pipeline",
     "RunStatistics": "slamdepth.types",
     "SlamdepthError": "slamdepth.errors",
     "StepResult": "slamdepth.types",
@@ -78,6 +87,7 @@ _HOME = {
     "create_tracker": "slamdepth.tracking",
     "open_dataset": "slamdepth.datasets",
     "read_tum_trajectory": "slamdepth.io",
+    "run": "slamdepth.pipeline.run",
     "score_trajectory": "slamdepth.evaluation",
     "write_tum_trajectory": "slamdepth.io",
 }
@@ -85,6 +95,7 @@ _HOME = {
 __all__ = [
     "Camera",
     "CameraError",
+    "CloudTracker",
     "Config",
     "ConfigError",
     "Dataset",
@@ -98,7 +109,12 @@ __all__ = [
     "Keyframe",
     "Mesh",
     "OutputError",
+    "Prepared",
     "Reconstruction",
+    "RunInterrupted",
+    "RunProgress",
+    "RunResult",
+    "RunStage",
     "RunStatistics",
     "SlamdepthError",
     "StepResult",
@@ -115,6 +131,7 @@ __all__ = [
     "create_tracker",
     "open_dataset",
     "read_tum_trajectory",
+    "run",
     "score_trajectory",
     "write_tum_trajectory",
 ]

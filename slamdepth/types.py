@@ -120,7 +120,7 @@ class Camera:
         """Map raw pixels ``(N, 2)`` to pixels ``(N, 2)`` of :meth:`without_distortion`."""
         points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 2)
         if not self.is_distorted or len(points) == 0:
-            return points.copy()
+            return np.array(points)
         import cv2
 
         undistorted = cv2.undistortPoints(points[:, None], self.K, self.distortion_array, P=self.K)

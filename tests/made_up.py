@@ -61,6 +61,7 @@ class MadeUpTracker:
     def __init__(self, lost: tuple[int, ...] = (), on_step: Callable[[Frame], None] | None = None) -> None:
         self.lost, self.on_step = lost, on_step or (lambda frame: None)
         self.seen: list[int] = []
+        self.closed = False
 
     def prepare(self, frame: Frame) -> int:
         return frame.index
@@ -72,6 +73,12 @@ class MadeUpTracker:
         is_lost = frame.index in self.lost
         status = TrackingStatus.LOST if is_lost else TrackingStatus.TRACKING
         return StepResult(frame.index, frame.timestamp_s, status, None if is_lost else pose(frame.index))
+
+    def __enter__(self) -> MadeUpTracker:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.closed = True
 
     def finish(self) -> Reconstruction:
         placed = [i for i in self.seen if i not in self.lost]

@@ -34,6 +34,7 @@ def test_every_public_name_can_be_had() -> None:
 def test_the_promised_names_are_public() -> None:
     promised = {"Tracker", "Frame", "Camera", "Config", "Trajectory", "Reconstruction", "StepResult"}
     promised |= {"open_dataset", "create_depth_model", "create_tracker", "SlamdepthError"}
+    promised |= {"run", "RunResult", "Prepared", "Mesh", "Dataset"}
     assert promised <= set(slamdepth.__all__)
 
 

@@ -319,6 +319,6 @@ def _solve_positive(S: Floats, rhs: Floats) -> Floats:
     from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
     try:
-        return cho_solve(cho_factor(S, check_finite=False), rhs, check_finite=False)
+        return np.asarray(cho_solve(cho_factor(S, check_finite=False), rhs, check_finite=False))
     except LinAlgError:
         return np.asarray(np.linalg.lstsq(S, rhs, rcond=None)[0], dtype=np.float64)

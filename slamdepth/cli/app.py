@@ -43,7 +43,7 @@ app.add_typer(weights.app, name="weights")
 
 def _print_version(asked: bool) -> None:
     if asked:
-        from slamdepth import __version__
+        from slamdepth._version import __version__
 
         typer.echo(f"slamdepth {__version__}")
         raise typer.Exit

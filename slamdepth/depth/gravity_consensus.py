@@ -38,7 +38,7 @@ class GravityConsensus:
         gravity_w = self.in_world()
         if gravity_w is None or self._queries % _CHECK_EVERY == 0:
             return None
-        return R_world_camera.T @ gravity_w
+        return np.asarray(R_world_camera.T @ gravity_w)
 
     def add(self, R_world_camera: Floats, gravity: Floats, confidence: float) -> None:
         """Add the estimate of one image.

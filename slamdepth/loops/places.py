@@ -61,7 +61,11 @@ class PlaceRecogniser:
         self.add_vector(keyframe_id, self.describe(descriptors))
 
     def add_vector(self, keyframe_id: int, vector: NDArray[np.float32]) -> None:
-        """The same by its place vector, see :meth:`describe`."""
+        """Remember a keyframe by its place vector ``(W,)``, see :meth:`describe`.
+
+        Raises:
+            TrackingError: the keyframe is already there.
+        """
         if keyframe_id in self._row_of:
             raise TrackingError(f"place recognition: keyframe {keyframe_id} was added before")
         row = len(self._ids)
@@ -103,7 +107,7 @@ class PlaceRecogniser:
     def _vector(self, keyframe_id: int) -> NDArray[np.float32]:
         if keyframe_id not in self._row_of:
             raise TrackingError(f"place recognition: keyframe {keyframe_id} was never added")
-        return self._vectors[self._row_of[keyframe_id]]
+        return np.asarray(self._vectors[self._row_of[keyframe_id]])
 
     def _ranked(
         self, vector: NDArray[np.float32], exclude: Collection[int], top_k: int

@@ -56,7 +56,7 @@ class MapView:
     def resolve(self, ids: Ints) -> Ints:
         """Landmarks that ``ids`` (any shape) were fused into; -1 where they are gone."""
         alias, alive = self.landmarks.alias, self.landmarks.alive
-        out = ids.copy()
+        out: Ints = np.array(ids)
         known = ids >= 0
         target = alias[ids[known]]
         while not np.array_equal(further := alias[target], target):
@@ -127,7 +127,7 @@ class MapView:
         distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-6)
         ray = offset / distance[:, None]
         variance = np.einsum("ni,nij,nj->n", ray, self.landmarks.covariance_w[ids], ray)
-        return np.sqrt(np.maximum(variance, 0.0)) / distance
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)) / distance)
 
     def mask(self, ids: Ints) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
         """``(size + 1,)`` True at ``ids``; the last entry, which -1 indexes, is False."""

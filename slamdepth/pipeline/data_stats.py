@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from slamdepth import __version__
+from slamdepth._version import __version__
 from slamdepth.errors import DatasetError, SlamdepthError
 from slamdepth.evaluation.depth_statistics import DepthStatistics
 from slamdepth.io import write_json

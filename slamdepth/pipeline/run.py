@@ -104,7 +104,8 @@ def run(
     stopped = stop or threading.Event()
     with run_log() as log:
         job = _prepare(options, settings, tell, stopped)
-        tracked = _track(job, log, tell, stopped)
+        with job.tracker:
+            tracked = _track(job, log, tell, stopped)
         return _finish(job, tracked, tell)
 
 

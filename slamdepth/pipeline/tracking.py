@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Protocol
 
 from slamdepth.datasets import Dataset
@@ -32,6 +33,12 @@ class AnyTracker(Protocol):
     def step(self, frame: Frame, prepared: Any = None) -> StepResult: ...
 
     def finish(self) -> Reconstruction: ...
+
+    def __enter__(self) -> Any: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,6 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-import slamdepth
-
 PACKAGES = (
     "numpy",
     "scipy",
@@ -61,7 +59,7 @@ def _version(name: str) -> str | None:
 
 
 def _commit() -> str | None:
-    root = Path(slamdepth.__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
     commit = _git(root, "rev-parse", "HEAD")

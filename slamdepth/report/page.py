@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import TYPE_CHECKING
 
-from slamdepth import __version__
+from slamdepth._version import __version__
 from slamdepth.report.text import count, fixed, percent
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slamdepth.backend.bundle import BundleResult
+from slamdepth.backend.bundle_problem import BundleResult
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.loops.closer import LoopCloser

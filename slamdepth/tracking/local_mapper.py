@@ -48,7 +48,7 @@ class LocalMapper:
         """Where a depth is known, in range, and certain enough by the model's own deviation."""
         config = self._config.depth
         in_range = (log_depth > np.log(config.min_m)) & (log_depth < np.log(config.max_m))
-        return in_range & (sigma_log < config.max_sigma_log)
+        return np.asarray(in_range & (sigma_log < config.max_sigma_log))
 
     def add_depth(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> None:
         """Give a keyframe its depth and create landmarks where it sees none yet.

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from slamdepth import __version__
+from slamdepth._version import __version__
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics
 from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.card import card_of
