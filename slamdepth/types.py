@@ -200,7 +200,7 @@ class DepthPrediction:
         is_sensor: True where the values were measured rather than predicted, so that
             their errors are independent from pixel to pixel and their scale is exact.
         gravity: direction of gravity as for :class:`Frame` that the model went by, or None.
-        gravity_share: how sure the model is of it, 0 to 1; 1 where the frame told it.
+        gravity_share: how sure the model is of it, 0 to 1; 1 where the frame brought it.
     """
 
     values: NDArray[np.float32]

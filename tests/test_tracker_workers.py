@@ -210,3 +210,14 @@ def test_a_closed_tracker_takes_no_frame_and_gives_no_result(odometry: str) -> N
         tracker.step(second)
     with pytest.raises(TrackingError, match="finished"):
         tracker.finish()
+
+
+def test_an_error_between_frames_that_nobody_waited_for_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    between = BetweenFrames()
+
+    def fail() -> None:
+        raise ValueError("the map broke")
+
+    between.begin(fail)
+    between.close()
+    assert "the map broke" in caplog.text

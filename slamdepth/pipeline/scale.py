@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """After tracking: the final scale of the map, and one sentence about it.
 
-The whole map may be multiplied: by what known sizes say, combined with the scale that the depth gave the
+The whole map may be rescaled: by known sizes, combined with the scale that the depth gave the
 map, or, where that is asked for, by the scale of the ground truth's trajectory.
 """
 

@@ -7,6 +7,7 @@ depend on how fast the threads were.
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,6 +22,8 @@ from slamdepth.stopwatch import Stopwatch
 from slamdepth.thread_limits import one_thread_here, single_threaded
 from slamdepth.types import DepthPrediction, Frame
 from slamdepth.typing import Floats
+
+log = logging.getLogger(__name__)
 
 _P = ParamSpec("_P")
 _S = TypeVar("_S")
@@ -68,6 +71,13 @@ class BetweenFrames(Worker):
         task, self._task = self._task, None
         if task is not None:
             task.result()
+
+    def close(self) -> None:
+        """End the thread; an error of a task that nobody waited for is logged."""
+        super().close()
+        task, self._task = self._task, None
+        if task is not None and not task.cancelled() and (error := task.exception()) is not None:
+            log.error("the work between two frames failed: %s", error)
 
 
 class DepthWorker:
