@@ -206,7 +206,8 @@ def _tiled(surface: Surface, rng: np.random.Generator) -> Mesh:
 def _textured(surface: Surface, image: np.ndarray, uv: np.ndarray) -> Mesh:
     """``surface`` as triangles; ``uv (2, 2)`` are the texture coordinates of its first and last corner."""
     rows, columns = surface.points.shape[:2]
-    u, v = np.linspace(*uv[:, 0], columns), np.linspace(*uv[:, 1], rows)
+    (u_0, v_0), (u_1, v_1) = uv
+    u, v = np.linspace(u_0, u_1, columns), np.linspace(v_0, v_1, rows)
     at = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     triangles = surface.triangles
     material = Material(np.asarray(image, np.float32), surface.emission)

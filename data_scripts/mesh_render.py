@@ -165,7 +165,8 @@ class MeshRenderer:
         exposure = np.exp(self._rng.normal(0.0, 0.45)) * 0.3 / max(middle, 0.01)
         knee = self._rng.uniform(0.0, 0.5)
         x = linear * np.float32(exposure)
-        return np.power(np.clip(x / (1 + knee * x), 0, 1), np.float32(1 / 2.2)).astype(np.float32)
+        encoded: np.ndarray = np.power(np.clip(x / (1 + knee * x), 0, 1), np.float32(1 / 2.2))
+        return encoded.astype(np.float32)
 
 
 def _smaller(image: np.ndarray) -> list[np.ndarray]:
@@ -188,4 +189,5 @@ def _sampled(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     row, row1, column, column1 = y0 % height, (y0 + 1) % height, x0 % width, (x0 + 1) % width
     upper = image[row, column] * (1 - fx) + image[row, column1] * fx
     lower = image[row1, column] * (1 - fx) + image[row1, column1] * fx
-    return upper * (1 - fy) + lower * fy
+    between: np.ndarray = upper * (1 - fy) + lower * fy
+    return between

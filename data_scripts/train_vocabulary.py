@@ -140,7 +140,7 @@ def _spread_seeds(distinct: Descriptors, count: int, rng: np.random.Generator) -
 
 def _majority(descriptors: Descriptors, cluster: NDArray[np.intp], previous: Descriptors) -> Descriptors:
     """The bitwise majority of each cluster; an empty cluster keeps its centre, a tie is 1."""
-    centres = previous.copy()
+    centres: Descriptors = previous.copy()
     order = np.argsort(cluster, kind="stable")
     bounds = np.searchsorted(cluster[order], np.arange(len(previous) + 1))
     for k in np.flatnonzero(np.diff(bounds)):

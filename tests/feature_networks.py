@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
+
+Shapes = Mapping[str, Sequence[int | str]]  # of named inputs or outputs; a word is a free size
 
 SIDE = 640
 CELL = 16
@@ -63,18 +66,23 @@ def write_lightglue(path: Path) -> Path:
         "zero": np.array(0),
         "one": np.array(1),
     }
-    inputs = {"kpts0": [1, "N", 2], "kpts1": [1, "M", 2], "desc0": [1, "N", 128], "desc1": [1, "M", 128]}
+    inputs: Shapes = {
+        "kpts0": [1, "N", 2],
+        "kpts1": [1, "M", 2],
+        "desc0": [1, "N", 128],
+        "desc1": [1, "M", 128],
+    }
     return _save(path, nodes, inputs, {"matches0": ["P", 2], "mscores0": ["P"]}, constants)
 
 
 def _save(
     path: Path,
     nodes: list[onnx.NodeProto],
-    inputs: dict[str, list[int | str]],
-    outputs: dict[str, list[int | str]],
+    inputs: Shapes,
+    outputs: Shapes,
     constants: dict[str, np.ndarray],
 ) -> Path:
-    def values(shapes: dict[str, list[int | str]]) -> list[onnx.ValueInfoProto]:
+    def values(shapes: Shapes) -> list[onnx.ValueInfoProto]:
         return [
             helper.make_tensor_value_info(
                 name, TensorProto.INT64 if name == "matches0" else TensorProto.FLOAT, shape

@@ -16,6 +16,7 @@ import sys
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from unittest import mock
 
 import torch
 import torch._dynamo  # imported by the first optimiser step; otherwise each child spends seconds on it
@@ -78,7 +79,7 @@ def tear_checkpoint(number: int) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         real(state, file)
 
-    torch.save = save
+    mock.patch.object(torch, "save", save).start()
 
 
 def main() -> None:

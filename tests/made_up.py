@@ -56,7 +56,7 @@ def pose(x_m: float) -> np.ndarray:
 
 
 class MadeUpTracker:
-    """Moves 1 m a frame; loses the frames it is told to."""
+    """Moves 1 m a frame; loses the frames of ``lost``."""
 
     def __init__(self, lost: tuple[int, ...] = (), on_step: Callable[[Frame], None] | None = None) -> None:
         self.lost, self.on_step = lost, on_step or (lambda frame: None)

@@ -33,7 +33,8 @@ def pretend_cuda(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         patch.setattr(torch.cuda, "is_available", lambda: True)
         patch.setattr(nn.Module, "to", _module_to)
         patch.setattr(nn.Module, "load_state_dict", _load_state_dict)
-        with _config.patch(meta_nonzero_assume_all_nonzero=True), _Pretending():
+        patch.setattr(_config, "meta_nonzero_assume_all_nonzero", True)
+        with _Pretending():
             yield
 
 

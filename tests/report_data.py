@@ -77,7 +77,9 @@ def full_data() -> ReportData:
     keyframes = tuple(keyframe(i) for i in range(6))
     scorer = DepthScorer(stride=1)
     for k in keyframes:
-        scorer.add(k.load_depth_m() * 1.1, k.frame.load().depth_m)
+        truth_m = k.frame.load().depth_m
+        assert truth_m is not None
+        scorer.add(k.load_depth_m() * 1.1, truth_m)
     states = [TrackingStatus.INITIALISING, *[TrackingStatus.TRACKING] * 29, *[TrackingStatus.LOST] * 10]
     states += [TrackingStatus.RELOCALISED, *[TrackingStatus.TRACKING] * 39]
     steps = tuple(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from slamdepth.types import Camera
 CAMERA = Camera(16, 12, 20.0, 21.0, 7.5, 5.5)
 
 
-def write_image(path: Path, image: NDArray[np.generic]) -> None:
+def write_image(path: Path, image: NDArray[Any]) -> None:
     """Write an RGB, grey or depth image without cv2's guesses about paths."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if image.ndim == 3:
@@ -24,6 +25,13 @@ def write_image(path: Path, image: NDArray[np.generic]) -> None:
     ok, data = cv2.imencode(path.suffix, image)
     assert ok
     path.write_bytes(data.tobytes())
+
+
+def imread(path: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
+    """``cv2.imread`` of a file that must decode; colours are BGR."""
+    image = cv2.imread(str(path), flags)
+    assert image is not None, f"{path} does not decode"
+    return image
 
 
 def image_rgb(seed: int, camera: Camera = CAMERA) -> NDArray[np.uint8]:

@@ -94,7 +94,7 @@ def test_a_smooth_bias_is_corrected_and_uncertainty_shrinks_near_landmarks() -> 
 
 def test_landmarks_on_another_surface_have_little_influence() -> None:
     """A wall behind a chair: the same pixels, another depth, an error of its own."""
-    px = np.tile([[160.0, 120.0]], (6, 1)) + np.arange(6)[:, None]
+    px = np.tile([[160.0, 120.0]], (6, 1)) + np.arange(6.0)[:, None]
     settings = FieldSettings(common_sigma=0.01)
     field = fit_depth_field(
         px, np.log(np.full(6, 1.0)), np.full(6, 0.3), np.log(np.full(6, 1.2)), np.full(6, 0.01),

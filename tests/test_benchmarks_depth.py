@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -152,7 +153,7 @@ def test_each_left_out_place_is_trained_once(tmp_path: Path) -> None:
         trainings.append([place.name for source in config.sources for place in source.places])
         Path(config.output).write_text("2.0")
 
-    def run(**more: object) -> tuple[list[dict], list[dict]]:
+    def run(**more: object) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         return left_out_rows(
             base_config(tmp_path / "data"), tmp_path / "out", ("near", "far"), [tmp_path / "data" / "unseen"],
             train=train, load=lambda head: ConstantDepth(float(head.read_text())),

@@ -191,10 +191,11 @@ def test_bad_calls(case: str, tiny_room: Path, tmp_path: Path) -> None:
     }
     places["FILE"] = tmp_path / "file"
     places["FILE/out"] = tmp_path / "file" / "out"
-    places["UNKNOWN"], places["GARBLED"] = tmp_path / "unknown.yaml", tmp_path / "garbled.yaml"
+    unknown, garbled = tmp_path / "unknown.yaml", tmp_path / "garbled.yaml"
+    places["UNKNOWN"], places["GARBLED"] = unknown, garbled
     (tmp_path / "file").write_text("")
-    places["UNKNOWN"].write_text("map: {voxel: 1}\n")
-    places["GARBLED"].write_text("a: [\n")
+    unknown.write_text("map: {voxel: 1}\n")
+    garbled.write_text("a: [\n")
     before = sorted(tmp_path.iterdir())
     done = call(*(places.get(argument, argument) for argument in arguments))
     assert done.returncode == 2, done.stderr

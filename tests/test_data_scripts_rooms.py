@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from sequences import imread
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "data_scripts"
 sys.path.insert(0, str(SCRIPTS))
@@ -60,7 +61,7 @@ def test_views_are_pairs_and_reproducible(tmp_path: Path) -> None:
     assert [p.read_bytes() for p in first] == [p.read_bytes() for p in again]
     about = json.loads((tmp_path / "a" / "camera.json").read_text(encoding="utf-8"))
     for image in first:
-        depth = cv2.imread(str(image.with_suffix(".png")), cv2.IMREAD_UNCHANGED)
+        depth = imread(image.with_suffix(".png"), cv2.IMREAD_UNCHANGED)
         assert depth.shape == (about["height"], about["width"])
         assert np.percentile(depth, 95) > 1.2 * np.percentile(depth, 5)  # not a piece of wall
     gravity = read_gravity(tmp_path / "a" / "gravity.txt")

@@ -7,13 +7,12 @@ import json
 import threading
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from command_line import call
 from hypothesis import given
 from hypothesis import strategies as st
-from sequences import image_rgb, make_sevenscenes, make_tum, write_image
+from sequences import image_rgb, imread, make_sevenscenes, make_tum, write_image
 
 from slamdepth.errors import ConfigError, DatasetError, OutputError
 from slamdepth.evaluation.depth_statistics import DepthStatistics
@@ -79,7 +78,7 @@ def test_every_kind_of_data_side_by_side(tmp_path: Path) -> None:
     page = (out / "data-stats.html").read_text()
     assert "near" in page
     assert "data:image/png;base64," in page
-    assert cv2.imread(str(out / "histograms.png")).shape[1] == 1440
+    assert imread(out / "histograms.png").shape[1] == 1440
     assert str(tmp_path) not in page + (out / "data-stats.json").read_text()
 
 

@@ -11,7 +11,7 @@ import pytest
 from command_line import call
 from hypothesis import given
 from hypothesis import strategies as st
-from sequences import CAMERA, depth_raw, image_rgb, make_sevenscenes, make_tum, write_image
+from sequences import CAMERA, depth_raw, image_rgb, imread, make_sevenscenes, make_tum, write_image
 
 from slamdepth.datasets import Dataset, known_readers, open_dataset, write_camera
 from slamdepth.datasets.readers.images import FolderSequence, ImagesReader
@@ -155,7 +155,7 @@ def test_the_kitchen_s_images_alone(data_dir: Path, tmp_path: Path) -> None:
     folder = tmp_path / "kitchen"
     folder.mkdir()
     for number, path in enumerate(paths):
-        cv2.imwrite(str(folder / f"{number}.png"), cv2.imread(str(path)))
+        cv2.imwrite(str(folder / f"{number}.png"), imread(path))
     write_camera(folder / "camera.yaml", Camera(640, 480, 585.0, 585.0, 320.0, 240.0))
     done = call("run", folder, "--no-mesh", "-q", "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr

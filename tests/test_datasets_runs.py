@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from command_line import call, images
+from sequences import imread
 from test_datasets_video import write_video
 from tracking_scene import register_constant_depth
 
@@ -60,7 +60,7 @@ def test_a_video_is_run_like_its_frames(
     tiny_room: Path, tmp_path: Path, camera_file: Path, expected: np.ndarray
 ) -> None:
     """Compression leaves the trajectory of the video about that of its images."""
-    frames = [cv2.imread(str(path)) for path in images(tiny_room)[:FRAMES]]
+    frames = [imread(path) for path in images(tiny_room)[:FRAMES]]
     video = write_video(tmp_path / "room.avi", frames, Camera.from_file(camera_file).fps)
     assert difference_rad(tracked(video, tmp_path / "out", "--camera", camera_file), expected) < 0.02
     refused = call("run", video, "--depth", "sensor", "--camera", camera_file)

@@ -13,6 +13,7 @@ from sequences import depth_raw, image_rgb, make_sevenscenes, poses, write_image
 
 from slamdepth.datasets import Dataset, known_readers, open_dataset, register_reader, write_camera
 from slamdepth.datasets.readers.sevenscenes import read_pose
+from slamdepth.datasets.readers.tum import TumReader
 from slamdepth.errors import CameraError, DatasetError
 from slamdepth.types import Camera
 
@@ -146,8 +147,8 @@ def test_readers_are_found_and_named_once() -> None:
     assert [reader.name for reader in known_readers()] == ["7scenes", "tum", "video"]
     assert all(reader.needs for reader in known_readers())
 
-    class Twice:
-        name = "tum"
+    class Twice(TumReader):
+        pass
 
     with pytest.raises(ValueError, match="two dataset readers are named 'tum'"):
         register_reader(Twice)

@@ -86,6 +86,7 @@ def test_depth_is_paired_by_time_one_to_one(tmp_path: Path) -> None:
     dataset = open_dataset(folder)
     depths = [dataset.read(i, with_depth=True).depth_m for i in range(4)]
     assert [depth is None for depth in depths] == [False, True, False, True]
+    assert depths[2] is not None
     np.testing.assert_allclose(depths[2], depth_raw(2) / 5000.0, rtol=1e-7)
     assert dataset.notes == ["depth.txt: 2 of 4 colour images have no depth image within 0.02 s"]
 
@@ -117,6 +118,7 @@ def test_camera_file_overrules_the_folders(tmp_path: Path) -> None:
     dataset = open_dataset(folder, tmp_path / "other.yaml")
     assert dataset.camera == other
     depth_m = dataset.read(0, with_depth=True).depth_m
+    assert depth_m is not None
     np.testing.assert_allclose(depth_m, depth_raw(0) / 1000.0, rtol=1e-7)
     assert "none.yaml: cannot be read" in error_of(folder, CameraError, tmp_path / "none.yaml")
 

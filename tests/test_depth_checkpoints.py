@@ -27,6 +27,7 @@ from torch.nn import functional as F
 from slamdepth.depth import depth_anything, dinov2_official
 from slamdepth.depth.alignment import log_depth_at
 from slamdepth.depth.base import DepthModel
+from slamdepth.depth.card import ModelCard
 from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.dinov2_heads import DptHead, LinearHead, OfficialHead
 from slamdepth.depth.dpt import BASE, LARGE, SMALL, DepthAnything, DptShape
@@ -294,7 +295,7 @@ def test_padding_is_cut_off_again() -> None:
             return (torch.arange(columns).float() + 1).expand(1, 14, columns)
 
     backbone = DinoV2(dim=24, depth=1, heads=3, grid=5).eval()
-    card = dinov2_official.ModelCard("ramp", DepthKind.METRIC, (30, 40), 60.0, "", "")
+    card = ModelCard("ramp", DepthKind.METRIC, (30, 40), 60.0, "", "")
     head = OfficialHead(Ramp())  # type: ignore[arg-type]
     model = dinov2_official.Dinov2OfficialDepth(backbone, head, card, (), taps=(0,))
     values = model.predict(frame_of(40, 30, focal=60.0)).values
@@ -305,7 +306,7 @@ def test_padding_is_cut_off_again() -> None:
 def test_final_norm_is_left_out_for_official_heads() -> None:
     backbone = DinoV2(dim=24, depth=1, heads=3, grid=5).eval()
     torch.nn.init.constant_(backbone.norm.weight, 0.0)
-    card = dinov2_official.ModelCard("linear", DepthKind.METRIC, (28, 28), None, "", "")
+    card = ModelCard("linear", DepthKind.METRIC, (28, 28), None, "", "")
     head = OfficialHead(LinearHead(24, 1, 10.0)).eval()
     model = dinov2_official.Dinov2OfficialDepth(backbone, head, card, (), taps=(0,))
     assert np.ptp(model.predict(frame_of()).values) > 0

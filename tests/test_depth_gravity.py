@@ -35,15 +35,18 @@ from slamdepth.types import Camera, Frame
 
 SHAPE = HeadShape(taps=(0, 2), token_dim=24, dim=16, blocks=1, guide_dim=8, scale_dim=4, gravity=True)
 _SEEDED = torch.Generator().manual_seed(1)
-ARGS = tuple(
-    torch.randn(shape, generator=_SEEDED) for shape in ((2, 2, 24, 3, 4), (2, 2, 24), (2, 3, 42, 56))
+ARGS = (
+    torch.randn(2, 2, 24, 3, 4, generator=_SEEDED),
+    torch.randn(2, 2, 24, generator=_SEEDED),
+    torch.randn(2, 3, 42, 56, generator=_SEEDED),
 )
 ROWS, COLUMNS = 70, 98
 CALM = AugmentConfig(upright_roll_deg=0.0, rolled=0.0, colour=0.0, blur=0.0, noise=0.0, jpeg=0.0)
 
 
 def unit(*xyz: float) -> np.ndarray:
-    return np.array(xyz) / np.linalg.norm(xyz)
+    direction: np.ndarray = np.array(xyz) / np.linalg.norm(xyz)
+    return direction
 
 
 def fields(*gravities: tuple[float, float, float], focal_px: float = 60.0) -> torch.Tensor:
@@ -89,7 +92,7 @@ def test_gravity_changes_the_prediction_of_a_trained_head_only() -> None:
     assert {name.rpartition(".")[0] for name in extra} == {"scale_branch.gravity", "field"}
     with torch.inference_mode():
         torch.testing.assert_close(head(*ARGS, field), without(*ARGS))
-        torch.nn.init.normal_(head.scale_branch.gravity.weight)
+        torch.nn.init.normal_(head.get_parameter("scale_branch.gravity.weight"))
         unmoved, rescaled = without.coarse(*ARGS)[0][:, 0], head.coarse(*ARGS, field)[0][:, 0]
         assert float((rescaled - unmoved).mean(dim=(1, 2)).abs().min()) > 0.05
         torch.nn.init.normal_(head.field.weight)
@@ -103,8 +106,8 @@ def test_gravity_changes_the_prediction_of_a_trained_head_only() -> None:
 def test_a_head_that_reads_gravity_comes_back_from_its_file(tmp_path: Path) -> None:
     torch.manual_seed(3)
     model = HeadEnsemble(replace(SHAPE, members=2))
-    for member in model.members:
-        torch.nn.init.normal_(member.field.weight)
+    for k in range(2):
+        torch.nn.init.normal_(model.get_parameter(f"members.{k}.field.weight"))
     save_head(tmp_path / "h.safetensors", model, {})
     loaded, about = load_head(tmp_path / "h.safetensors")
     assert loaded.shape == replace(SHAPE, members=2)
@@ -127,22 +130,24 @@ def test_a_head_that_reads_gravity_needs_a_scale_branch(tmp_path: Path) -> None:
         load_head(tmp_path / "bad.safetensors")
 
 
-def with_gravity(folder: Path, *downs: np.ndarray, count: int = 4) -> Place:
+def with_gravity(folder: Path, *gravities: np.ndarray, count: int = 4) -> Place:
     make_place(folder, count)
-    lines = [f"{k:05d} {' '.join(f'{value:.8f}' for value in down)}\n" for k, down in enumerate(downs)]
+    lines = [f"{k:05d} {' '.join(f'{x:.8f}' for x in xyz)}\n" for k, xyz in enumerate(gravities)]
     (folder / "gravity.txt").write_text("".join(lines))
     return open_place(folder)
 
 
 def test_gravity_txt(tmp_path: Path) -> None:
-    downs = [unit(0.1, 0.9, 0.3), unit(-1, 0, 0)]
-    place = with_gravity(tmp_path / "room", *downs)
-    for index, down in enumerate(downs):
-        np.testing.assert_allclose(place.gravity(index), down, atol=1e-7)
+    gravities = [unit(0.1, 0.9, 0.3), unit(-1, 0, 0)]
+    place = with_gravity(tmp_path / "room", *gravities)
+    for index, gravity_c in enumerate(gravities):
+        read = place.gravity(index)
+        assert read is not None
+        np.testing.assert_allclose(read, gravity_c, atol=1e-7)
     assert place.gravity(2) is None
     silent = open_place(make_place(tmp_path / "silent"))
     assert silent.gravity(0) is None
-    other = with_gravity(tmp_path / "other", downs[0], -downs[1])  # a file of the same size
+    other = with_gravity(tmp_path / "other", gravities[0], -gravities[1])  # a file of the same size
     assert len({place.fingerprint, silent.fingerprint, other.fingerprint}) == 3
 
 
@@ -310,11 +315,12 @@ def test_only_what_a_sample_teaches_is_learnt(relief: float, level: float) -> No
     target = torch.rand(2, 6, 8) + 1.0
     target[:, :2] = 0.0
     prediction = head.coarse(*ARGS)[0]
-    total_loss(
-        supervised(prediction, target, torch.tensor([[relief, level]] * 2)), target, LossConfig()
-    ).backward()
+    supervision = torch.tensor([[relief, level]] * 2)
+    loss = total_loss(supervised(prediction, target, supervision), target, LossConfig())
+    torch.autograd.backward(loss)
     assert head.scale_branch is not None
     assert head.out.weight.grad is not None
+    assert head.scale_branch.out.bias.grad is not None
     of_relief = head.out.weight.grad[0].abs().max()  # log depth; the other row is its spread
     of_level = head.scale_branch.out.bias.grad.abs().max()
     for found, is_taught in ((of_relief, relief), (of_level, level)):
@@ -401,8 +407,8 @@ def test_a_head_learns_with_gravity_the_same_for_the_same_seed(
     first = result.output.read_bytes()
     head, _ = load_head(result.output)
     assert head.shape.gravity
-    assert bool(head.members[0].field.weight.any())
-    assert bool(head.members[0].scale_branch.gravity.weight.any())
+    for name in ("field", "scale_branch.gravity"):
+        assert bool(head.get_parameter(f"members.0.{name}.weight").any())
     assert loop.train_depth(config, backbone=tiny_backbone()).output.read_bytes() == first
 
 

@@ -37,10 +37,10 @@ def test_ticks_are_round_and_inside(low: float, span: float, most: int) -> None:
 
 def test_near_is_dark_blue_and_far_is_yellow_for_every_kind() -> None:
     near, far = rgb_of(NEAR_TO_FAR[0]), rgb_of(NEAR_TO_FAR[-1])
-    metres = np.float32([[1.0, 3.0, 0.0, np.nan]])
+    metres = np.array([[1.0, 3.0, 0.0, np.nan]], np.float32)
     shown = coloured(metres, Scale(1.0, 3.0, METRIC))[0].tolist()
     assert shown == [list(near), list(far), list(rgb_of(UNKNOWN)), list(rgb_of(UNKNOWN))]
-    disparity = np.float32([[9.0, 0.0, -1.0, np.nan]])
+    disparity = np.array([[9.0, 0.0, -1.0, np.nan]], np.float32)
     shown = coloured(disparity, Scale(9.0, 0.0, INVERSE))[0].tolist()
     assert shown == [list(near), list(far), list(far), list(rgb_of(UNKNOWN))]
 
@@ -111,8 +111,8 @@ def test_colour_images_come_back(tmp_path: Path) -> None:
 def test_a_cloud_is_read_by_open3d(tmp_path: Path) -> None:
     from slamdepth.open3d_loader import import_open3d
 
-    points = np.float32([[0, 1, 2], [3, 4, 5.5]])
-    colors = np.uint8([[255, 0, 51], [0, 102, 204]])
+    points = np.array([[0, 1, 2], [3, 4, 5.5]], np.float32)
+    colors = np.array([[255, 0, 51], [0, 102, 204]], np.uint8)
     (tmp_path / "p.ply").write_bytes(encode_ply(points, colors, comments=["focal: 60°"]))
     cloud = import_open3d().io.read_point_cloud(str(tmp_path / "p.ply"))
     np.testing.assert_allclose(np.asarray(cloud.points), points)

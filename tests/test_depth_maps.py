@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from command_line import call
 from depth_map_models import INVERSE, METRIC, files, make, photos, register_ramps, video
-from sequences import CAMERA, image_rgb, make_tum, write_image
+from sequences import CAMERA, image_rgb, imread, make_tum, write_image
 
 from slamdepth.datasets import write_camera
 from slamdepth.depth.sensor import SensorDepth
@@ -44,12 +44,12 @@ def test_one_image_gets_every_form_and_they_agree(tmp_path: Path) -> None:
     values = np.load(out / "p8.depth-metres.npy")
     assert values.dtype == np.float32
     assert values.shape == (48, 64)
-    millimetres = cv2.imread(str(out / "p8.depth-mm.png"), cv2.IMREAD_UNCHANGED)
+    millimetres = imread(out / "p8.depth-mm.png", cv2.IMREAD_UNCHANGED)
     assert millimetres.dtype == np.uint16
     assert millimetres[0, 0] == millimetres[0, 1] == 0  # beyond, and unknown
     np.testing.assert_array_equal(millimetres[1:], np.rint(values[1:].astype(np.float64) * 1000))
     assert "1 pixels of 1 image lie beyond 65.535 m and are 0" in about["notes"][0]
-    colour = cv2.imread(str(out / "p8.colour.png"))
+    colour = imread(out / "p8.colour.png")
     assert colour.shape[0] > 48
     assert colour.shape[1] == 64
     header, points = points_of(out / "p8.cloud.ply")
@@ -59,7 +59,7 @@ def test_one_image_gets_every_form_and_they_agree(tmp_path: Path) -> None:
     found = points[row * 64 + column - 1]
     z = values[row, column]
     np.testing.assert_allclose(found["xyz"], [(column - 31.5) / fx * z, (row - 23.5) / fx * z, z], rtol=1e-5)
-    source = cv2.imread(str(tmp_path / "in" / "p8.png"))
+    source = imread(tmp_path / "in" / "p8.png")
     np.testing.assert_array_equal(found["rgb"], source[row, column, ::-1])
     assert "a guess: 60 degrees" in header
 
@@ -108,7 +108,7 @@ def test_relative_depth_gets_no_metres(tmp_path: Path) -> None:
     assert "known up to a scale and an offset" in about["scale"]
     readme = (out / "README.txt").read_text()
     assert "metres" not in readme
-    colour = cv2.imread(str(out / "colour" / "p8.colour.png"))[10, :, ::-1].astype(int)
+    colour = imread(out / "colour" / "p8.colour.png")[10, :, ::-1].astype(int)
     assert colour[0].sum() > 2 * colour[-1].sum()  # small inverse depth is far, so bright
 
 
@@ -165,7 +165,7 @@ def test_a_fixed_range_colours_all_alike(tmp_path: Path) -> None:
     from slamdepth.report.depth_map import Scale
 
     expected = coloured(values, Scale(0.0, 10.0, DepthKind.METRIC))
-    np.testing.assert_array_equal(cv2.imread(str(out / "colour" / "p8.colour.png"))[:48, :, ::-1], expected)
+    np.testing.assert_array_equal(imread(out / "colour" / "p8.colour.png")[:48, :, ::-1], expected)
     with pytest.raises(ConfigError, match="no range in metres"):
         make(tmp_path / "in", tmp_path / "other", INVERSE, colour_range=(0.0, 10.0))
 
@@ -175,7 +175,7 @@ def test_a_sequence_brings_camera_and_sensor(tmp_path: Path) -> None:
     assert about["scale"] == "metric, measured by the depth sensor"
     assert about["frames"] == 3
     assert (tmp_path / "out" / "side-by-side.mp4").stat().st_size > 0
-    raw = cv2.imread(str(tmp_path / "seq" / "depth" / "0.png"), cv2.IMREAD_UNCHANGED)
+    raw = imread(tmp_path / "seq" / "depth" / "0.png", cv2.IMREAD_UNCHANGED)
     values = np.load(tmp_path / "out" / "depth-metres" / "frame-000000.depth-metres.npy")
     np.testing.assert_allclose(values, raw / 5000.0, rtol=1e-6)
 

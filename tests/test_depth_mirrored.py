@@ -26,7 +26,7 @@ class Left:
     """Predicts 1 to 4 by the column of a pixel, whatever the image; estimates gravity."""
 
     name = "left"
-    weights = (WeightsInfo("left", "00", "nothing", "none"),)
+    weights: tuple[WeightsInfo, ...] = (WeightsInfo("left", "00", "nothing", "none"),)
 
     def __init__(self, kind: DepthKind = DepthKind.METRIC, unknown: tuple[int, ...] = ()) -> None:
         self.kind, self.unknown = kind, unknown
@@ -36,7 +36,7 @@ class Left:
         self.frames.append(frame)
         values = np.tile(np.arange(1, 5, dtype=np.float32), (3, 1))
         values[:, list(self.unknown)] = 0
-        return DepthPrediction(values, self.kind, values / 10, gravity=GRAVITY, gravity_share=0.7)
+        return DepthPrediction(values, self.kind, values / np.float32(10), gravity=GRAVITY, gravity_share=0.7)
 
 
 def test_metric_depth_is_the_geometric_mean_of_both_predictions() -> None:
@@ -70,6 +70,7 @@ def test_the_mirror_image_is_predicted_with_the_estimated_gravity(
     MirroredDepth(model).predict(frame(gravity))
     as_taken, mirrored = model.frames
     assert as_taken.gravity is gravity
+    assert mirrored.gravity is not None
     np.testing.assert_allclose(mirrored.gravity, [-0.6, 0.64, 0.48])
     np.testing.assert_array_equal(mirrored.image_rgb, as_taken.image_rgb[:, ::-1])
     assert mirrored.depth_m is None
@@ -103,10 +104,12 @@ def test_mirrored_models_are_created_by_name(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_sensor_of_any_name_is_not_mirrored() -> None:
     with pytest.raises(ConfigError, match="a sensor's depth needs no mirror; use 'sensor'"):
         create_depth_model("mirrored:sensor")
-    model = Left()
-    model.is_sensor = True
+
+    class Measured(Left):
+        is_sensor = True
+
     with pytest.raises(ConfigError, match="'mirrored:left': a sensor's depth needs no mirror; use 'left'"):
-        MirroredDepth(model)
+        MirroredDepth(Measured())
 
 
 def test_the_card_is_that_of_the_model(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ def test_mlp_scales_features_and_applies_a_softplus_after_each_layer() -> None:
     x = scaled
     for index in range(3):
         layer = head.layers[index]
-        x = F.softplus(x @ layer.weight.T + layer.bias)  # type: ignore[operator, union-attr]
+        x = F.softplus(x @ layer.weight.T + layer.bias)
     torch.testing.assert_close(head(samples), x.view(7, 2, 2))
     assert (head(-100 * samples) >= 0).all()
 

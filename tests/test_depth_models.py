@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from sequences import imread
 
 from slamdepth.depth import registry
 from slamdepth.depth import weights as store
@@ -152,7 +153,9 @@ def test_missing_backbone_names_the_command(monkeypatch: pytest.MonkeyPatch, tmp
 class _Scaled:
     """Sensor depth times a factor, with a given sigma: an error that must be found exactly."""
 
-    name, kind, weights = "scaled", DepthKind.METRIC, ()
+    name = "scaled"
+    kind = DepthKind.METRIC
+    weights: tuple[WeightsInfo, ...] = ()
 
     def __init__(self, factor: float, sigma: float) -> None:
         self.factor, self.sigma = factor, sigma
@@ -199,9 +202,9 @@ def test_shipped_model_on_a_real_image(data_dir: Path) -> None:
     assert [len(info.sha256) for info in model.weights] == [64, 64]
     assert "TUM" in model.weights[1].trained_on
     folder = data_dir / "7scenes_redkitchen_seq-01"
-    image = cv2.imread(str(folder / "frame-000000.color.jpg"))[:, :, ::-1].copy()
-    depth = cv2.imread(str(folder / "frame-000000.depth.png"), cv2.IMREAD_UNCHANGED)
-    depth_m = np.where(depth < 60000, depth, 0).astype(np.float32) / 1000
+    image = imread(folder / "frame-000000.color.jpg")[:, :, ::-1].copy()
+    depth = imread(folder / "frame-000000.depth.png", cv2.IMREAD_UNCHANGED)
+    depth_m = np.where(depth < 60000, depth, 0).astype(np.float32) / np.float32(1000)
     frame = Frame(0, 0.0, image, Camera(640, 480, 585, 585, 320, 240), depth_m)
     judged = judge_depth(model, [frame])
     # zero-shot: the right order of magnitude and better than a constant

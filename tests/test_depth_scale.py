@@ -37,7 +37,7 @@ def frame(number: int) -> Frame:
 class Network:
     """Predicts true depth as a linear map of it, with errors of its own."""
 
-    weights = (WeightsInfo("net", "ab" * 32, "rooms", "MIT"),)
+    weights: tuple[WeightsInfo, ...] = (WeightsInfo("net", "ab" * 32, "rooms", "MIT"),)
 
     def __init__(
         self,
@@ -205,8 +205,9 @@ def test_a_fitted_scale_gives_metric_depth(kind: DepthKind) -> None:
 
 
 def test_a_scale_alone_leaves_the_uncertainty_unchanged() -> None:
-    prediction = ScaledDepth(Network(), DepthScale(1.5)).predict(frame(0))
-    np.testing.assert_allclose(prediction.values[8:], 1.5 * frame(0).depth_m[8:], rtol=1e-6)  # type: ignore[index]
+    prediction, truth = ScaledDepth(Network(), DepthScale(1.5)).predict(frame(0)), frame(0).depth_m
+    assert truth is not None
+    np.testing.assert_allclose(prediction.values[8:], 1.5 * truth[8:], rtol=1e-6)
     np.testing.assert_array_equal(prediction.sigma_log, np.full((48, 64), np.float32(0.2)))
 
 

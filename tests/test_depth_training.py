@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from slamdepth.training.augment import augmented_view, turned_view, unaugmented_
 from slamdepth.training.config import AugmentConfig, TrainConfig
 from slamdepth.training.data import data_folder, open_place
 from slamdepth.training.losses import laplace_nll, multiscale_gradient, scale_invariant
+from slamdepth.training.results import TrainResult
 from slamdepth.training.stages import coarse_target
 from slamdepth.training.store import SampleStore
 from slamdepth.training.views import plan_samples
@@ -27,7 +29,7 @@ from slamdepth.types import Camera, Frame
 
 
 @pytest.fixture
-def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
+def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     monkeypatch.setenv("SLAMDEPTH_CACHE", str(tmp_path / "cache"))
     make_place(tmp_path / "data" / "room")
     make_place(tmp_path / "data" / "other", 2)
@@ -51,11 +53,11 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
     }
 
 
-def train(settings: dict) -> loop.TrainResult:
+def train(settings: dict[str, Any]) -> TrainResult:
     return loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone())
 
 
-def test_training_writes_a_loadable_head_and_judges_held_out_places(settings: dict) -> None:
+def test_training_writes_a_loadable_head_and_judges_held_out_places(settings: dict[str, Any]) -> None:
     result = train(settings)
     head, about = load_head(result.output)
     assert head.shape.members == 2
@@ -68,7 +70,7 @@ def test_training_writes_a_loadable_head_and_judges_held_out_places(settings: di
     assert not list(result.output.parent.glob("*.checkpoint"))
 
 
-def test_training_is_deterministic(settings: dict) -> None:
+def test_training_is_deterministic(settings: dict[str, Any]) -> None:
     first = train(settings).output.read_bytes()
     assert train(settings).output.read_bytes() == first
     other = train({**settings, "seed": 1}).output.read_bytes()
@@ -76,14 +78,14 @@ def test_training_is_deterministic(settings: dict) -> None:
 
 
 def test_a_killed_training_resumes_to_the_same_result(
-    settings: dict, monkeypatch: pytest.MonkeyPatch
+    settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = train(settings)
     expected = whole.output.read_bytes()
     whole.output.unlink()
     real, calls = member.run_epoch, []
 
-    def dies(*args: object, **kwargs: object) -> float:
+    def dies(*args: Any, **kwargs: Any) -> float:
         calls.append(1)
         if len(calls) == 5:  # in the second member's second epoch
             raise KeyboardInterrupt
@@ -98,14 +100,14 @@ def test_a_killed_training_resumes_to_the_same_result(
     np.testing.assert_array_equal(again.losses, whole.losses)
 
 
-def test_features_are_computed_once(settings: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_features_are_computed_once(settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     train(settings)
     model = tiny_backbone()
     monkeypatch.setattr(model, "forward", lambda *a: pytest.fail("the features are cached"))
     loop.train_depth(TrainConfig.from_dict({**settings, "learning_rate": 1e-3}), backbone=model)
 
 
-def test_learning_happens(settings: dict) -> None:
+def test_learning_happens(settings: dict[str, Any]) -> None:
     plain = dict.fromkeys(("flip", "rolled", "colour", "blur", "noise", "jpeg", "max_tilt_deg"), 0.0)
     view = {**settings["view"], "augment": {**plain, "upright_roll_deg": 0.0, "max_zoom": 1.0}}
     result = train({**settings, "members": 1, "coarse_epochs": 40, "fine_epochs": 0, "view": view,
@@ -123,7 +125,7 @@ def test_samples_of_another_shape_are_not_stored(tmp_path: Path) -> None:
     assert store.arrays["done"].tolist() == [1, 1, 0]
 
 
-def test_a_place_is_not_both_trained_on_and_held_out(settings: dict) -> None:
+def test_a_place_is_not_both_trained_on_and_held_out(settings: dict[str, Any]) -> None:
     both = {**settings["sources"][0], "held_out": ["room"]}
     with pytest.raises(ConfigError, match=r"room is held out and also trained on"):
         train({**settings, "sources": [both]})
@@ -156,13 +158,13 @@ def test_a_place_is_not_both_trained_on_and_held_out(settings: dict) -> None:
         ({"head": {"down_dim": 8}}, "setting 'head.down_dim': unknown setting"),
     ],
 )
-def test_bad_settings_are_named(settings: dict, change: dict, says: str) -> None:
+def test_bad_settings_are_named(settings: dict[str, Any], change: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError) as error:
         TrainConfig.from_dict({**settings, **change}, origin="train.yaml")
     assert str(error.value).startswith(f"train.yaml: {says}")
 
 
-def test_training_on_no_depth_is_an_error(settings: dict, caplog: pytest.LogCaptureFixture) -> None:
+def test_training_on_no_depth_is_an_error(settings: dict[str, Any], caplog: pytest.LogCaptureFixture) -> None:
     settings["view"] |= {"min_depth_m": 8.0, "max_depth_m": 9.0}
     with pytest.raises(DatasetError, match=r"room, third: no view .* has depth between 8 and 9 m; check"):
         train(settings)
@@ -171,7 +173,7 @@ def test_training_on_no_depth_is_an_error(settings: dict, caplog: pytest.LogCapt
 
 
 def test_every_member_needs_depth_and_a_place_without_is_logged(
-    settings: dict, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    settings: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     for file in (tmp_path / "data" / "third").glob("*.png"):
         cv2.imwrite(str(file), np.zeros((48, 64), np.uint16))
@@ -310,7 +312,7 @@ def test_unknown_pixels_have_no_gradient() -> None:
     prediction = torch.zeros(1, 2, 28, 28, requires_grad=True)
     target = torch.full((1, 28, 28), 2.0)
     target[:, :, 14:] = 0.0
-    total_loss(prediction, target, LossConfig()).backward()
+    torch.autograd.backward(total_loss(prediction, target, LossConfig()))
     assert prediction.grad is not None
     assert bool(torch.isfinite(prediction.grad).all())
     assert float(prediction.grad[..., 14:].abs().max()) == 0.0

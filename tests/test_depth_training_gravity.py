@@ -13,7 +13,7 @@ import torch
 from killed_training import tiny_backbone
 from training_places import make_place
 
-from slamdepth.depth.gravity_direction import GravityEstimate
+from slamdepth.depth.gravity_direction import GravityEstimate, token_fields
 from slamdepth.depth.head import HeadEnsemble, HeadShape, load_head
 from slamdepth.depth.model import Dinov2Depth
 from slamdepth.errors import ConfigError
@@ -67,7 +67,7 @@ def test_the_network_learns_to_recognise_gravity(monkeypatch: pytest.MonkeyPatch
     other, rng, right = views_that_show_gravity(30, 1), np.random.default_rng(2), 0
     for k in range(len(other)):
         candidates = candidate_directions(other.gravity[k].astype(float), rng)
-        fields = training_gravity.token_fields(torch.from_numpy(candidates).float(), 60.0, 56, 70)
+        fields = token_fields(torch.from_numpy(candidates).float(), 60.0, 56, 70)
         tokens = torch.from_numpy(other.tokens[k : k + 1]).float()
         with torch.inference_mode():
             best = candidates[int(scorer(tokens, fields[None])[0].argmax())]

@@ -19,6 +19,7 @@ from slamdepth.training.config import TrainConfig
 from slamdepth.training.features import FeatureCache
 from slamdepth.training.member import MemberTraining
 from slamdepth.training.plan import plan_training
+from slamdepth.training.results import TrainResult
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     }
 
 
-def train(settings: dict[str, Any]) -> loop.TrainResult:
+def train(settings: dict[str, Any]) -> TrainResult:
     return loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone())
 
 
@@ -72,7 +73,12 @@ def test_a_checkpoint_of_another_head_format_is_not_resumed(
             train(settings)
     epochs: list[int] = []
     real = member.run_epoch
-    monkeypatch.setattr(member, "run_epoch", lambda *a: (epochs.append(a[5]), real(*a))[1])
+
+    def listed(*args: Any) -> float:
+        epochs.append(args[5])
+        return real(*args)
+
+    monkeypatch.setattr(member, "run_epoch", listed)
     monkeypatch.setattr(loop, "FORMAT", "another")
     train(settings)
     assert epochs == [0, 1, 0, 1]  # of both members, from the start

@@ -108,7 +108,8 @@ def test_features_do_not_depend_on_the_scale_of_a_frame() -> None:
 
 def test_folds_share_no_place_and_leave_out_no_mixed_view(settings: dict[str, Any]) -> None:
     planned = plan_caches(TrainConfig.from_dict(settings), Encoder(tiny_backbone()).key)
-    everything, nothing = [0, 1, 2, 3], []
+    everything: list[int] = [0, 1, 2, 3]
+    nothing: list[int] = []
     found = [
         ([views.tolist() for views in fold.training], [views.tolist() for views in fold.left_out])
         for fold in plan_folds(planned)
@@ -186,7 +187,8 @@ def test_a_plan_counts_the_time_of_every_fit(
 def outputs(head: Any) -> tuple[torch.Tensor, torch.Tensor]:
     torch.manual_seed(0)
     with torch.inference_mode():
-        return head(torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56))
+        log_depth, sigma = head(torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56))
+    return log_depth, sigma
 
 
 @pytest.mark.parametrize(
@@ -206,7 +208,12 @@ def test_an_interrupted_fit_resumes_to_the_same_bytes(
         loop.train_depth(config, progress=interrupt, backbone=tiny_backbone())
     epochs: list[int] = []
     real = member.run_epoch
-    monkeypatch.setattr(member, "run_epoch", lambda *a: (epochs.append(a[6]), real(*a))[1])
+
+    def listed(*args: Any) -> float:
+        epochs.append(args[6])
+        return real(*args)
+
+    monkeypatch.setattr(member, "run_epoch", listed)
     again = loop.train_depth(config, backbone=tiny_backbone())
     assert again.output.read_bytes() == whole
     assert epochs == {"member 1 of 1": [0, 0, 0, 1, 1, 2, 2], "without places, 2": [2, 2]}.get(stage, [])

@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import yaml
 from command_line import call
 from killed_training import tiny_backbone
+from sequences import imread
 from training_places import tiny_settings
 
 from slamdepth.depth import weights
@@ -37,7 +38,7 @@ def test_a_training_writes_a_report(settings: dict[str, Any]) -> None:
         "losses.png", "samples.png", "history.json", "README.txt"
     }  # fmt: skip
     for name in ("losses.png", "samples.png"):
-        image = cv2.imread(str(folder / name))
+        image = imread(folder / name)
         assert image is not None
         assert image.std() > 10
     history = json.loads((folder / "history.json").read_text())
@@ -113,9 +114,7 @@ def test_a_damaged_checkpoint_starts_its_member_again(
 def test_a_full_disk_is_an_error_before_any_work(
     settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from slamdepth.training import store
-
-    monkeypatch.setattr(store.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1000}))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1000}))
     with pytest.raises(OutputError, match=r"the features need 0\.00 GB and 0\.00 GB are free; set SLAMDEPTH"):
         loop.train_depth(TrainConfig.from_dict(settings), backbone=tiny_backbone())
 
@@ -177,4 +176,4 @@ def test_plots_are_the_same_for_the_same_training(settings: dict[str, Any]) -> N
     for path in paths:
         draw_samples(path, result.samples[:1])
     assert paths[0].read_bytes() == paths[1].read_bytes()
-    assert np.unique(cv2.imread(str(paths[0])).reshape(-1, 3), axis=0).shape[0] > 50
+    assert np.unique(imread(paths[0]).reshape(-1, 3), axis=0).shape[0] > 50

@@ -17,16 +17,18 @@ WITHIN_DEG = 1.5  # lines are found to half a pixel of a 340 pixel image, 0.1 de
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # columns: right, down, forward; the world's z is up
 
 
-def held(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
+def rotation_of(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
     """``R_world_camera`` of a camera that looks down by its pitch, with gravity to the right by its roll."""
     turns = ([0, yaw_deg, 0], [-pitch_deg, 0, 0], [0, 0, roll_deg])
     yaw, pitch, roll = (so3_exp(np.radians(turn)) for turn in turns)
-    return UPRIGHT @ yaw @ pitch @ roll
+    R_world_camera: np.ndarray = UPRIGHT @ yaw @ pitch @ roll
+    return R_world_camera
 
 
 def any_turn(seed: int) -> np.ndarray:
     R, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    return R * np.linalg.det(R)
+    R *= np.linalg.det(R)
+    return R
 
 
 def segments(seed: int, count: int) -> np.ndarray:
@@ -85,7 +87,7 @@ def test_the_three_directions_of_a_room_are_found_from_any_viewpoint(camera: Cam
 
 
 def test_distortion_is_undone() -> None:
-    image = drawn(segments(1, 40), held(25, 10, 5), DISTORTED)
+    image = drawn(segments(1, 40), rotation_of(25, 10, 5), DISTORTED)
     right, ignored = (
         manhattan_frames(find_lines(image, camera))[0].support.sum()
         for camera in (DISTORTED, DISTORTED.without_distortion())
@@ -95,7 +97,7 @@ def test_distortion_is_undone() -> None:
 
 @pytest.mark.parametrize("roll_deg", [-30, 0, 20])
 def test_the_same_lines_give_the_same_bytes(roll_deg: float) -> None:
-    image = drawn(segments(2, 40), held(30, 15, roll_deg), CAMERA)
+    image = drawn(segments(2, 40), rotation_of(30, 15, roll_deg), CAMERA)
     first, again = (manhattan_frames(find_lines(image.copy(), CAMERA), 4) for _ in range(2))
     assert len(first) == len(again) > 1
     for one, other in zip(first, again, strict=True):
@@ -133,7 +135,7 @@ def test_lines_are_planes_through_the_camera() -> None:
 )
 @pytest.mark.parametrize("yaw_deg", [12, 40])
 def test_gravity_is_found_in_an_image_held_upright(yaw_deg: float, pitch_deg: float, roll_deg: float) -> None:
-    R = held(yaw_deg, pitch_deg, roll_deg)
+    R = rotation_of(yaw_deg, pitch_deg, roll_deg)
     true = -R[2]
     assert np.degrees(np.arctan2(true[0], true[1])) == pytest.approx(roll_deg, abs=1e-6)
     assert np.degrees(np.arcsin(true[2])) == pytest.approx(pitch_deg)
@@ -148,7 +150,7 @@ def test_a_blank_image_gives_no_gravity() -> None:
 
 
 def test_frames_differ_and_come_by_how_many_lines_run_along_them() -> None:
-    R, turn = held(10, 5, 0), so3_exp(np.radians([20.0, 15.0, 35.0]))
+    R, turn = rotation_of(10, 5, 0), so3_exp(np.radians([20.0, 15.0, 35.0]))
     ends = np.concatenate([segments(6, 45), segments(7, 30) @ turn.T])
     frames = manhattan_frames(find_lines(drawn(ends, R, CAMERA), CAMERA), 2)
     assert len(frames) == 2
@@ -167,7 +169,7 @@ def test_most_lines_of_a_room_support_its_directions() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(320, 240), (1280, 960)])
 def test_the_size_of_an_image_does_not_matter(width: int, height: int) -> None:
-    R = held(20, 10, 5)
+    R = rotation_of(20, 10, 5)
     camera = DISTORTED.scaled(width, height)
     found = best(drawn(segments(8, 40), R, camera), camera)
     usual = best(drawn(segments(8, 40), R, DISTORTED), DISTORTED)

@@ -21,7 +21,7 @@ def room(seed: int = 0, shape: tuple[int, int] = (24, 32)) -> np.ndarray:
 
 
 def test_errors_by_hand() -> None:
-    errors = depth_errors(np.float32([1.0, 3.0, 2.0]), np.float32([1.0, 2.0, 4.0]))
+    errors = depth_errors(np.array([1.0, 3.0, 2.0], np.float32), np.array([1.0, 2.0, 4.0], np.float32))
     assert errors.abs_rel == pytest.approx((0 + 0.5 + 0.5) / 3)
     assert errors.rmse_m == pytest.approx(np.sqrt((0 + 1 + 4) / 3))
     assert errors.log_rmse == pytest.approx(np.sqrt((np.log(1.5) ** 2 + np.log(2) ** 2) / 3))

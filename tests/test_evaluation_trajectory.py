@@ -238,7 +238,7 @@ def assert_agrees_with_evo(truth_file: Path, estimate_file: Path, home: Path, *o
         assert error.median_m == pytest.approx(stats["median"], abs=1e-9)
         assert error.max_m == pytest.approx(stats["max"], abs=1e-9)
         assert error.scale == pytest.approx(stats["scale"], abs=1e-9)
-    for drift, trans, rot in ((score.per_frame, *rpe[:2]), (score.per_second, *rpe[2:])):
+    for drift, (trans, rot) in ((score.per_frame, rpe[:2]), (score.per_second, rpe[2:])):
         assert drift.trans_rmse_m == pytest.approx(trans["rmse"], abs=1e-9)
         assert drift.rot_rmse_deg == pytest.approx(rot["rmse"], abs=1e-9)
 

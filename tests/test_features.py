@@ -31,7 +31,7 @@ CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 def image(seed: int = 0, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
     """Strong texture in one corner and weak texture elsewhere, as rooms have."""
     rng = np.random.default_rng(seed)
-    noise = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), 1.5)
+    noise = np.asarray(cv2.GaussianBlur(rng.normal(size=shape), (0, 0), 1.5), np.float64)
     noise /= noise.std()
     contrast = np.full(shape, 12.0)
     contrast[:100, :120] = 60.0
@@ -106,7 +106,7 @@ def test_weak_texture_gets_its_share(extractor: FeatureExtractor) -> None:
 
 def test_orb_spreads_wider_than_opencv_does(orb: FeatureExtractor) -> None:
     ours = occupancy(orb.extract(image(), CAMERA).raw_px)
-    own = cv2.ORB_create(nfeatures=300, fastThreshold=7).detect(image(), None)
+    own = cv2.ORB.create(nfeatures=300, fastThreshold=7).detect(image(), None)
     assert ours > 1.3 * occupancy(np.array([k.pt for k in own]))
 
 

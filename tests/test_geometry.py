@@ -39,7 +39,8 @@ seeds = st.integers(0, 2**32 - 1)
 
 def directions(seed: int) -> np.ndarray:
     v = np.random.default_rng(seed).normal(size=3)
-    return v / np.linalg.norm(v)
+    v /= np.linalg.norm(v)
+    return v
 
 
 @given(seeds, st.floats(0, np.pi - 1e-6))

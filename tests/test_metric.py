@@ -39,7 +39,8 @@ def random_descriptors(metric: DescriptorMetric, count: int, rng: np.random.Gene
     if none.dtype == np.uint8:
         return rng.integers(0, 256, (count, none.shape[1]), dtype=np.uint8)
     vectors = rng.normal(size=(count, none.shape[1]))
-    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors.astype(np.float32)
 
 
 def slow_distance(a: np.ndarray, b: np.ndarray) -> float:

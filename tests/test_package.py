@@ -40,7 +40,7 @@ def test_the_promised_names_are_public() -> None:
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'Traker'"):
-        _ = slamdepth.Traker  # type: ignore[attr-defined]
+        _ = slamdepth.Traker
 
 
 def test_every_error_is_public() -> None:

@@ -18,6 +18,7 @@ from slamdepth.pipeline import RunInterrupted, RunOptions, RunProgress, RunStage
 from slamdepth.pipeline.prefetch import FramePrefetcher, ReadFrame
 from slamdepth.pipeline.run import _settings_text
 from slamdepth.pipeline.tracking import Tracked, track
+from slamdepth.types import Frame
 
 
 def tracked_of(
@@ -69,11 +70,16 @@ def test_leaving_early_ends_the_reader() -> None:
     assert threading.active_count() == before
 
 
-def test_only_a_few_frames_are_read_ahead() -> None:
+def test_only_a_few_frames_are_read_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = MadeUpDataset(1000)
     read: list[int] = []
     original = dataset.read
-    dataset.read = lambda index, **keys: (read.append(index), original(index, **keys))[1]  # type: ignore[method-assign]
+
+    def listed(index: int, *, with_depth: bool = False) -> Frame:
+        read.append(index)
+        return original(index, with_depth=with_depth)
+
+    monkeypatch.setattr(dataset, "read", listed)
     with FramePrefetcher(dataset, range(1000), with_depth=False, capacity=3) as reader:
         frames = iter(reader)
         for _ in range(5):

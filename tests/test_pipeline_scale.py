@@ -74,7 +74,8 @@ def room_depth(T_world_camera: np.ndarray, floor_m: float | None, desk_m: float 
             hit = (desk_m - origin[1]) / rays[..., 1]
             x, z = origin[0] + hit * rays[..., 0], origin[2] + hit * rays[..., 2]
             depth = np.where((hit > 0) & (np.abs(x) < 0.6) & (z > 1.0) & (z < 2.0), hit, depth)
-    return depth.astype(np.float32)
+    seen: np.ndarray = depth.astype(np.float32)
+    return seen
 
 
 def room(
@@ -191,7 +192,7 @@ def test_the_ground_truth_gives_the_scale() -> None:
 
 
 def scaled(trajectory: Trajectory, factor: float) -> np.ndarray:
-    T = trajectory.T_world_camera.copy()
+    T: np.ndarray = trajectory.T_world_camera.copy()
     T[:, :3, 3] *= factor
     return T
 
@@ -230,7 +231,8 @@ def test_without_a_known_size_the_scale_is_the_networks_with_its_uncertainty() -
     made, facts, notes = settled(reconstruction_of())
     assert (facts.source, facts.factor, facts.from_ground_truth) == (ScaleSource.NETWORK, 1.0, False)
     assert facts.uncertainty_log == pytest.approx(math.hypot(NETWORK_SIGMA_LOG, np.std(VOTES) / math.sqrt(5)))
-    assert (facts.keyframes, facts.spread, notes) == (5, pytest.approx(np.std(VOTES)), ())
+    assert facts.spread == pytest.approx(np.std(VOTES))
+    assert (facts.keyframes, notes) == (5, ())
     assert "predicted by net" in facts.sentence
     assert "no sensor measured it" in facts.sentence
     np.testing.assert_array_equal(made.points_m, reconstruction_of().points_m)

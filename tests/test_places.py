@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sequences import imread
 
 from slamdepth.errors import TrackingError, WeightsError
 from slamdepth.frontend.metric import hamming_nearest
@@ -163,12 +164,12 @@ def test_a_real_loop_is_among_the_first_ten(data_dir: Path) -> None:
     turned = rotation_angle_rad(np.einsum("iab,jac->ijbc", R, R))
     is_loop = apart & near & (turned < np.radians(30))
 
-    orb = cv2.ORB_create(nfeatures=1000, fastThreshold=7)
+    orb = cv2.ORB.create(nfeatures=1000, fastThreshold=7)
     recogniser = PlaceRecogniser()
     for k, (_, name) in enumerate(lines):
-        image = cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE)
-        recogniser.add(k, orb.detectAndCompute(image, None)[1])
-    queries = np.flatnonzero(is_loop.any(axis=1))
+        image = imread(folder / name, cv2.IMREAD_GRAYSCALE)
+        recogniser.add(k, np.asarray(orb.detectAndCompute(image, None)[1], np.uint8))
+    queries = np.flatnonzero(is_loop.any(axis=1)).tolist()
     found = [
         any(
             is_loop[k, i] for i, _ in recogniser.query_keyframe(k, exclude=np.flatnonzero(~apart[k]).tolist())

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -34,7 +36,7 @@ def errors(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(D[:3, 3])), float(np.degrees(rotation_angle_rad(D[:3, :3])))
 
 
-def refine(T0: np.ndarray, X: np.ndarray, px: np.ndarray, **more: object) -> PoseEstimate:
+def refine(T0: np.ndarray, X: np.ndarray, px: np.ndarray, **more: Any) -> PoseEstimate:
     n = len(X)
     covariance = more.pop("covariance", np.zeros((n, 3, 3)))
     return refine_pose(CAMERA, T0, X, covariance, px, np.ones(n), **more)

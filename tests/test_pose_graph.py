@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ def circle(count: int, turns: float = 1.0, radius_m: float = 2.0) -> np.ndarray:
     return invert(T[:1]) @ T
 
 
-def measured(T: np.ndarray, i: int, j: int, *, scales: np.ndarray | None = None, **more: object) -> Edge:
+def measured(T: np.ndarray, i: int, j: int, *, scales: np.ndarray | None = None, **more: Any) -> Edge:
     """The exact edge between keyframes whose own metres are ``scales`` metres of the world."""
     s = np.ones(len(T)) if scales is None else scales
     T_i_j = invert(T[i]) @ T[j]
@@ -176,7 +178,9 @@ def test_arguments_are_not_changed() -> None:
         (lambda T, e: (T, [replace(e[0], scale_i_j=-1.0), *e[1:]]), "scale and its three sigmas"),
     ],
 )
-def test_unsound_graphs_are_refused(change, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_unsound_graphs_are_refused(
+    change: Callable[[np.ndarray, list[Edge]], tuple[np.ndarray, list[Edge]]], message: str
+) -> None:
     T = circle(5)
     poses, edges = change(T, odometry(T))
     with pytest.raises(TrackingError, match=message):

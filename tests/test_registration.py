@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sequences import imread
 
 from slamdepth.errors import CameraError, TrackingError
 from slamdepth.frontend.registration import (
@@ -43,7 +44,8 @@ def render(T_world_camera: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
     leave = to_planes.max(axis=2).min(axis=2)
     depth = np.where((enter < leave) & (enter > 0), enter, np.inf)
     depth[0] = leave[0]
-    return depth.min(axis=0).reshape(u.shape).astype(np.float32)
+    nearest: np.ndarray = depth.min(axis=0).reshape(u.shape).astype(np.float32)
+    return nearest
 
 
 def cloud(T_world_camera: np.ndarray, stride: int = 1) -> np.ndarray:
@@ -246,7 +248,7 @@ def test_a_real_cloud_finds_its_place(data_dir: Path) -> None:
     camera = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, depth_factor=1000.0)
 
     def read(k: int) -> tuple[np.ndarray, np.ndarray]:
-        raw = cv2.imread(str(folder / f"frame-{k:06d}.depth.png"), cv2.IMREAD_UNCHANGED)
+        raw = imread(folder / f"frame-{k:06d}.depth.png", cv2.IMREAD_UNCHANGED)
         depth_m = np.where(raw == 65535, 0, raw).astype(np.float32) / 1000
         return depth_to_cloud(depth_m, camera), np.loadtxt(folder / f"frame-{k:06d}.pose.txt")
 

@@ -7,6 +7,7 @@ import getpass
 import json
 import re
 import socket
+from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from io import StringIO
@@ -21,6 +22,7 @@ from rich.console import Console
 from slamdepth.config import Config
 from slamdepth.errors import OutputError
 from slamdepth.report import (
+    ReportData,
     ScaleSource,
     build_html,
     build_summary,
@@ -130,8 +132,8 @@ def test_write_report_into_no_folder_is_one_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [full_data, bare_data])
-def test_page_is_whole_escaped_and_self_contained(make: object) -> None:
-    data = make()  # type: ignore[operator]
+def test_page_is_whole_escaped_and_self_contained(make: Callable[[], ReportData]) -> None:
+    data = make()
     page = build_html(data, build_summary(data))
     parser = BalancedTags()
     parser.feed(page)

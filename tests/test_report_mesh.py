@@ -12,12 +12,12 @@ from command_line import leave_out_plots
 from report_data import bare_data, full_data
 
 from slamdepth.errors import OutputError
-from slamdepth.geometry import invert, project, so3_exp, transform
+from slamdepth.geometry import invert, look_at, project, so3_exp, transform
 from slamdepth.io import read_image_rgb
 from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report import MeshImage, build_html, build_summary, render_mesh_images, write_mesh_png
-from slamdepth.report.viewpoints import from_above, guessed_gravity, ideal_camera, look_at, over_the_shoulder
+from slamdepth.report.viewpoints import from_above, guessed_gravity, ideal_camera, over_the_shoulder
 from slamdepth.types import Trajectory
 
 DOWN = np.array([0.0, 1.0, 0.0])

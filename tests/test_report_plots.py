@@ -104,7 +104,7 @@ def test_lost_frames_break_the_curves() -> None:
 
 
 def test_depth_runs_from_dark_blue_over_green_to_yellow() -> None:
-    colours = colour_depth(np.float32([[1.0, 2.0, 3.0, 0.0, np.nan, 0.5, 9.0]]), 1.0, 3.0)[0]
+    colours = colour_depth(np.array([[1.0, 2.0, 3.0, 0.0, np.nan, 0.5, 9.0]], np.float32), 1.0, 3.0)[0]
     as_hex = ["#{:02x}{:02x}{:02x}".format(*colour) for colour in colours]
     assert as_hex[0] == as_hex[5] == NEAR_TO_FAR[0]
     assert as_hex[2] == as_hex[6] == NEAR_TO_FAR[-1]

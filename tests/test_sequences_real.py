@@ -78,7 +78,8 @@ def errors_in_one_map_m(
     assert first is not None
     moved = first @ moved
     shift = np.nanmean(estimate[:aligned] - moved[:aligned, :3, 3], axis=0)
-    return np.linalg.norm(estimate - moved[:, :3, 3] - shift, axis=1)
+    distance_m: np.ndarray = np.linalg.norm(estimate - moved[:, :3, 3] - shift, axis=1)
+    return distance_m
 
 
 def test_two_seconds_of_black_frames_in_the_kitchen(data_dir: Path) -> None:

