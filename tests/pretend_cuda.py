@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.fx.experimental import _config
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves
 
+_CONFIG = import_module("torch.fx.experimental._config")  # PyTorch adds its ``patch`` when it is imported
 _TAKES_BOTH = {"__getitem__", "__setitem__", "copy_"}
 _SCALARS: dict[str, Any] = {"item": 1.0, "__float__": 1.0, "__int__": 1000, "__bool__": True}
 
@@ -33,8 +34,7 @@ def pretend_cuda(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         patch.setattr(torch.cuda, "is_available", lambda: True)
         patch.setattr(nn.Module, "to", _module_to)
         patch.setattr(nn.Module, "load_state_dict", _load_state_dict)
-        patch.setattr(_config, "meta_nonzero_assume_all_nonzero", True)
-        with _Pretending():
+        with _CONFIG.patch(meta_nonzero_assume_all_nonzero=True), _Pretending():
             yield
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bundle adjustment on exact little scenes, and beside GTSAM on a noisy one."""
+"""Bundle adjustment on small exact scenes, and against GTSAM on a noisy one."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def without_depth(problem: BundleProblem) -> BundleProblem:
     return replace(problem, log_depth=np.full(len(problem.px), np.nan))
 
 
-def disturbed(problem: BundleProblem, size: float = 0.02, seed: int = 1) -> BundleProblem:
+def perturbed(problem: BundleProblem, size: float = 0.02, seed: int = 1) -> BundleProblem:
     rng = np.random.default_rng(seed)
     K = len(problem.fixed)
     T = se3_exp(size * rng.normal(size=(K, 6)) * ~problem.fixed[:, None]) @ problem.T_camera_world
@@ -79,7 +79,7 @@ def test_exact_observations_lead_to_the_truth(seed: int, with_depth: bool) -> No
     exact = truth(seed=seed)
     if not with_depth:
         exact = without_depth(exact)
-    result = bundle_adjust(disturbed(exact, seed=seed), iterations=(10, 10))
+    result = bundle_adjust(perturbed(exact, seed=seed), iterations=(10, 10))
     assert pose_error(result.T_camera_world, exact.T_camera_world) < 1e-6
     np.testing.assert_allclose(result.points_w, exact.points_w, atol=1e-5)
     assert result.final_cost < 1e-6 < result.initial_cost
@@ -89,7 +89,7 @@ def test_exact_observations_lead_to_the_truth(seed: int, with_depth: bool) -> No
 
 
 def test_fixed_cameras_stay_and_arguments_are_left_alone() -> None:
-    problem = noisy(disturbed(replace(truth(), sigma_scale=0.1)), 1.0)
+    problem = noisy(perturbed(replace(truth(), sigma_scale=0.1)), 1.0)
     before = [a.copy() for a in (problem.T_camera_world, problem.points_w, problem.px)]
     result = bundle_adjust(problem)
     np.testing.assert_array_equal(result.T_camera_world[:2], before[0][:2])
@@ -98,14 +98,14 @@ def test_fixed_cameras_stay_and_arguments_are_left_alone() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_the_readout_time_is_found_with_its_doubt() -> None:
+def test_the_readout_time_is_found_with_its_uncertainty() -> None:
     """Pixels moved by 20 ms of a rolling shutter, each camera's in its own way."""
     exact = truth()
     rng = np.random.default_rng(7)
     speed = rng.normal(0, 300.0, (len(exact.fixed), 2))
     phase = exact.px[:, 1:] / CAMERA.height - 0.5
     rate = speed[exact.obs_camera] * phase
-    problem = replace(disturbed(replace(exact, px=exact.px - 0.02 * rate)), px_rate=rate)
+    problem = replace(perturbed(replace(exact, px=exact.px - 0.02 * rate)), px_rate=rate)
     result = bundle_adjust(problem, iterations=(10, 10))
     assert result.readout_s == pytest.approx(0.02, abs=1e-6)
     assert pose_error(result.T_camera_world, exact.T_camera_world) < 1e-6
@@ -140,7 +140,7 @@ def test_nothing_to_adjust() -> None:
 def test_outliers_are_flagged_and_do_no_harm() -> None:
     exact = without_depth(truth())
     rng = np.random.default_rng(4)
-    problem = noisy(disturbed(exact), 0.3)
+    problem = noisy(perturbed(exact), 0.3)
     wrong = rng.permutation(len(problem.px))[: len(problem.px) // 20]
     heading = rng.uniform(0, 2 * np.pi, len(wrong))
     problem.px[wrong] += 25.0 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
@@ -166,7 +166,7 @@ def test_points_behind_a_camera_are_outliers() -> None:
 
 def test_agrees_with_gtsam() -> None:
     gtsam = pytest.importorskip("gtsam")
-    problem = noisy(disturbed(without_depth(truth())), 1.0)
+    problem = noisy(perturbed(without_depth(truth())), 1.0)
     problem.px[::25] += 8.0  # enough to reach Huber's linear part
     ours = bundle_adjust(problem, iterations=(30,) * 10, gate=np.inf)
 
@@ -201,7 +201,7 @@ def test_agrees_with_gtsam() -> None:
 def test_a_common_depth_error_goes_into_the_scale_of_its_keyframe() -> None:
     exact = truth()
     wrong = np.array([0.0, 0.2, 0.0, -0.15, 0.0, 0.1])
-    problem = replace(disturbed(exact), log_depth=exact.log_depth - wrong[exact.obs_camera], sigma_scale=0.3)
+    problem = replace(perturbed(exact), log_depth=exact.log_depth - wrong[exact.obs_camera], sigma_scale=0.3)
     result = bundle_adjust(problem, iterations=(10, 10))
     np.testing.assert_allclose(result.log_scale, wrong, atol=0.01)
     assert pose_error(result.T_camera_world, exact.T_camera_world) < 3e-3
@@ -222,7 +222,7 @@ def test_depth_gives_the_scale_where_one_camera_is_fixed() -> None:
 
 def test_a_wild_depth_is_outvoted() -> None:
     exact = truth()
-    problem = disturbed(exact)
+    problem = perturbed(exact)
     log_depth = exact.log_depth.copy()
     log_depth[::7] += 1.5
     result = bundle_adjust(replace(problem, log_depth=log_depth), iterations=(10, 10))
@@ -232,7 +232,7 @@ def test_a_wild_depth_is_outvoted() -> None:
 
 @pytest.mark.parametrize("sigma_scale", [0.0, 0.2])
 def test_sparse_and_dense_eliminations_agree(monkeypatch: pytest.MonkeyPatch, sigma_scale: float) -> None:
-    problem = noisy(disturbed(replace(truth(), sigma_scale=sigma_scale)), 0.5)
+    problem = noisy(perturbed(replace(truth(), sigma_scale=sigma_scale)), 0.5)
     dense = bundle_adjust(problem)
     monkeypatch.setattr(bundle_solver, "_DENSE_LIMIT", 0)
     sparse = bundle_adjust(problem)
@@ -242,7 +242,7 @@ def test_sparse_and_dense_eliminations_agree(monkeypatch: pytest.MonkeyPatch, si
 
 
 def test_the_order_of_observations_does_not_matter() -> None:
-    problem = noisy(disturbed(truth()), 0.5)
+    problem = noisy(perturbed(truth()), 0.5)
     order = np.random.default_rng(0).permutation(len(problem.px))
     names = ("obs_camera", "obs_point", "px", "sigma_px", "log_depth", "sigma_log")
     other = bundle_adjust(replace(problem, **{name: getattr(problem, name)[order] for name in names}))

@@ -44,7 +44,7 @@ def run_example(heading: str) -> None:
     exec(compile(found[1], "CONTRIBUTING.md", "exec"), module.__dict__)
 
 
-def picture() -> np.ndarray:
+def noise_image() -> np.ndarray:
     noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
     return np.asarray(cv2.resize(noise, (320, 240), interpolation=cv2.INTER_CUBIC))
 
@@ -52,7 +52,7 @@ def picture() -> np.ndarray:
 def test_the_depth_model() -> None:
     run_example("Add a depth model")
     model = depth_registry.create_depth_model("wall")
-    prediction = model.predict(Frame(0, 0.0, picture(), CAMERA))
+    prediction = model.predict(Frame(0, 0.0, noise_image(), CAMERA))
     assert prediction.values.shape == (240, 320)
     assert "wall" in depth_registry.depth_model_names()
 
@@ -60,7 +60,7 @@ def test_the_depth_model() -> None:
 def test_the_dataset(tmp_path: Path) -> None:
     run_example("Add a dataset")
     for number in range(3):
-        cv2.imwrite(str(tmp_path / f"numbered-{number:03d}.png"), picture())
+        cv2.imwrite(str(tmp_path / f"numbered-{number:03d}.png"), noise_image())
     write_camera(tmp_path / "own.yaml", CAMERA)
     dataset = open_dataset(tmp_path, tmp_path / "own.yaml")
     assert len(dataset) == 3
@@ -70,7 +70,7 @@ def test_the_dataset(tmp_path: Path) -> None:
 def test_the_feature() -> None:
     run_example("Add a feature")
     extractor = features.create_extractor(FeatureConfig(name="sift-fine", count=200))
-    found = extractor.extract(np.asarray(cv2.cvtColor(picture(), cv2.COLOR_RGB2GRAY)), CAMERA)
+    found = extractor.extract(np.asarray(cv2.cvtColor(noise_image(), cv2.COLOR_RGB2GRAY)), CAMERA)
     assert len(found) > 20
     assert set(found.octave.tolist()) <= {0, 1, 2, 3}
     assert "sift-fine" in features.feature_names()

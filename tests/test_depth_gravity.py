@@ -164,7 +164,7 @@ def test_a_bad_line_of_gravity_txt_is_named(tmp_path: Path, line: str) -> None:
         open_place(folder)
 
 
-def test_down_is_what_the_place_says_or_else_what_lines_tell_and_is_remembered(
+def test_gravity_is_read_from_the_place_or_estimated_from_lines_and_cached(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked: list[Camera] = []
@@ -198,18 +198,18 @@ def plane_frame() -> Frame:
     return Frame(0, 0.0, np.repeat((depth * 60).astype(np.uint8)[..., None], 3, 2), camera, depth)
 
 
-def assert_the_plane_is_where_gravity_says(view: View, down: np.ndarray) -> None:
-    """The plane is turned as ``down`` was: known from its depths, it makes the same angle with it."""
+def assert_the_plane_is_where_gravity_says(view: View, gravity_c: np.ndarray) -> None:
+    """The plane is turned as ``gravity_c`` was: known from its depths, it makes the same angle with it."""
     v, u = np.nonzero(view.depth_m)
     assert len(u) > 0.3 * view.depth_m.size
     rays = np.column_stack([u - (COLUMNS - 1) / 2, v - (ROWS - 1) / 2, np.full(len(u), view.focal_px)])
     points = rays / view.focal_px * view.depth_m[v, u][:, None]
     found = np.linalg.lstsq(points, np.ones(len(points)), rcond=None)[0]
     assert 1 / np.linalg.norm(found) == pytest.approx(DISTANCE_M, rel=0.01)
-    assert found @ view.gravity / np.linalg.norm(found) == pytest.approx(NORMAL @ down, abs=0.02)
+    assert found @ view.gravity / np.linalg.norm(found) == pytest.approx(NORMAL @ gravity_c, abs=0.02)
 
 
-DOWNS = st.builds(
+GRAVITIES = st.builds(
     lambda roll, pitch: unit(
         np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch), np.sin(pitch)
     ),
@@ -218,22 +218,22 @@ DOWNS = st.builds(
 )  # fmt: skip
 
 
-@given(down=DOWNS, seed=st.integers(0, 99))
+@given(gravity_c=GRAVITIES, seed=st.integers(0, 99))
 @settings(max_examples=25, deadline=None)
-def test_views_are_turned_upright(down: np.ndarray, seed: int) -> None:
+def test_views_are_turned_upright(gravity_c: np.ndarray, seed: int) -> None:
     frame = plane_frame()
     calm = CALM.model_copy(update={"max_tilt_deg": 0.0})
     for view in (
-        unaugmented_view(frame, ROWS, COLUMNS, down),
-        augmented_view(frame, ROWS, COLUMNS, calm, np.random.default_rng(seed), down),
+        unaugmented_view(frame, ROWS, COLUMNS, gravity_c),
+        augmented_view(frame, ROWS, COLUMNS, calm, np.random.default_rng(seed), gravity_c),
     ):
         assert np.linalg.norm(view.gravity) == pytest.approx(1.0)
         assert view.gravity[0] == pytest.approx(0.0, abs=1e-9)
         assert view.gravity[1] > 0
-        assert view.gravity[2] == pytest.approx(down[2])
-        assert_the_plane_is_where_gravity_says(view, down)
-    tilted = augmented_view(frame, ROWS, COLUMNS, CALM, np.random.default_rng(seed), down)
-    assert_the_plane_is_where_gravity_says(tilted, down)
+        assert view.gravity[2] == pytest.approx(gravity_c[2])
+        assert_the_plane_is_where_gravity_says(view, gravity_c)
+    tilted = augmented_view(frame, ROWS, COLUMNS, CALM, np.random.default_rng(seed), gravity_c)
+    assert_the_plane_is_where_gravity_says(tilted, gravity_c)
 
 
 def rolled_deg(view: View) -> float:
@@ -241,28 +241,28 @@ def rolled_deg(view: View) -> float:
 
 
 def test_rolls_are_drawn_about_upright() -> None:
-    down, rng = unit(-0.7, 0.5, 0.1), np.random.default_rng(0)
+    gravity_c, rng = unit(-0.7, 0.5, 0.1), np.random.default_rng(0)
     calm = CALM.model_copy(update={"upright_roll_deg": 4.0, "max_tilt_deg": 0.0})
-    rolls = [rolled_deg(augmented_view(plane_frame(), 28, 42, calm, rng, down)) for _ in range(60)]
+    rolls = [rolled_deg(augmented_view(plane_frame(), 28, 42, calm, rng, gravity_c)) for _ in range(60)]
     assert abs(np.mean(rolls)) < 1.6
     assert 3.0 < np.std(rolls) < 5.2
     wide = calm.model_copy(update={"rolled": 1.0, "max_roll_deg": 90.0})
-    rolls = [rolled_deg(augmented_view(plane_frame(), 28, 42, wide, rng, down)) for _ in range(60)]
+    rolls = [rolled_deg(augmented_view(plane_frame(), 28, 42, wide, rng, gravity_c)) for _ in range(60)]
     assert np.abs(rolls).max() < 90
     assert np.std(rolls) > 40
 
 
-@given(down=DOWNS, wanted=DOWNS, seed=st.integers(0, 99))
+@given(gravity_c=GRAVITIES, wanted=GRAVITIES, seed=st.integers(0, 99))
 @settings(max_examples=25, deadline=None)
 def test_a_partner_is_turned_until_gravity_points_as_wanted(
-    down: np.ndarray, wanted: np.ndarray, seed: int
+    gravity_c: np.ndarray, wanted: np.ndarray, seed: int
 ) -> None:
     """However differently the two cameras were rolled, upside down too."""
-    pitch = np.arcsin(down[2]) + np.radians(10)  # no further apart than partners are
+    pitch = np.arcsin(gravity_c[2]) + np.radians(10)  # no further apart than partners are
     wanted = np.append(wanted[:2] / np.linalg.norm(wanted[:2]) * np.cos(pitch), np.sin(pitch))
-    view = matching_view(plane_frame(), ROWS, COLUMNS, CALM, np.random.default_rng(seed), down, wanted)
+    view = matching_view(plane_frame(), ROWS, COLUMNS, CALM, np.random.default_rng(seed), gravity_c, wanted)
     np.testing.assert_array_equal(view.gravity, wanted)
-    assert_the_plane_is_where_gravity_says(view, down)
+    assert_the_plane_is_where_gravity_says(view, gravity_c)
 
 
 def mixing(*places: Place) -> tuple[ViewConfig, list[Partner]]:
@@ -297,47 +297,49 @@ def test_what_is_mixed_into_a_view_shares_its_gravity(
     assert (mixed.image_rgb != alone.image_rgb).any()
     assert len(taken) == 2
     assert all(abs(np.degrees(np.arcsin(of) - np.arcsin(to))) < 16 for of, to in taken)
-    # nothing fits: unmixed; nothing is known of the first: mixed as ever
+    # nothing fits: not mixed; unknown gravity of the first: mixed
     for others in ([steep], [silent]):
         unmixed = make_view(places, key, config, 3, mixing(*others)[1])
         np.testing.assert_array_equal(unmixed.image_rgb, alone.image_rgb)
-    unknown, plain = SampleKey(1, 0, 0), config.model_copy(update={"upright": False})
+    unknown, tilted = SampleKey(1, 0, 0), config.model_copy(update={"upright": False})
     as_ever = make_view(places, unknown, config, 3, partners)
-    np.testing.assert_array_equal(as_ever.image_rgb, make_view(places, unknown, plain, 3, partners).image_rgb)
+    np.testing.assert_array_equal(
+        as_ever.image_rgb, make_view(places, unknown, tilted, 3, partners).image_rgb
+    )
     assert not as_ever.gravity.any()
-    assert not make_view(places, key, plain, 3, partners).gravity.any()
+    assert not make_view(places, key, tilted, 3, partners).gravity.any()
 
 
-@pytest.mark.parametrize(("relief", "level"), [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
-def test_only_what_a_sample_teaches_is_learnt(relief: float, level: float) -> None:
+@pytest.mark.parametrize(("shape", "scale"), [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+def test_only_what_a_sample_supervises_is_learnt(shape: float, scale: float) -> None:
     torch.manual_seed(4)
     head = DepthHead(SHAPE)
     target = torch.rand(2, 6, 8) + 1.0
     target[:, :2] = 0.0
     prediction = head.coarse(*ARGS)[0]
-    supervision = torch.tensor([[relief, level]] * 2)
+    supervision = torch.tensor([[shape, scale]] * 2)
     loss = total_loss(supervised(prediction, target, supervision), target, LossConfig())
     torch.autograd.backward(loss)
     assert head.scale_branch is not None
     assert head.out.weight.grad is not None
     assert head.scale_branch.out.bias.grad is not None
-    of_relief = head.out.weight.grad[0].abs().max()  # log depth; the other row is its spread
-    of_level = head.scale_branch.out.bias.grad.abs().max()
-    for found, is_taught in ((of_relief, relief), (of_level, level)):
-        assert float(found) > 1e-3 if is_taught else float(found) < 1e-6  # rounding
+    of_shape = head.out.weight.grad[0].abs().max()  # log depth; the other row is its spread
+    of_scale = head.scale_branch.out.bias.grad.abs().max()
+    for found, is_supervised in ((of_shape, shape), (of_scale, scale)):
+        assert float(found) > 1e-3 if is_supervised else float(found) < 1e-6  # rounding
 
 
-def test_a_sample_that_teaches_no_level_costs_nothing_for_its_scale() -> None:
+def test_a_sample_that_does_not_supervise_scale_has_no_scale_loss() -> None:
     torch.manual_seed(5)
     prediction, target = torch.randn(2, 2, 6, 8), torch.rand(2, 6, 8) + 1.0
-    both, relief = torch.ones(2, 2), torch.tensor([[1.0, 0.0], [1.0, 1.0]])
+    both, shape_only = torch.ones(2, 2), torch.tensor([[1.0, 0.0], [1.0, 1.0]])
     assert supervised(prediction, target, both) is prediction
-    losses = [total_loss(supervised(prediction, f * target, relief), f * target, LossConfig()) for f in
+    losses = [total_loss(supervised(prediction, f * target, shape_only), f * target, LossConfig()) for f in
               (torch.ones(2, 1, 1), torch.tensor([3.0, 1.0])[:, None, None])]  # fmt: skip
     torch.testing.assert_close(*losses)
-    told = supervised(prediction, target, relief)
-    torch.testing.assert_close(told[1], prediction[1])
-    error = told[0, 0] - target[0].log()
+    corrected = supervised(prediction, target, shape_only)
+    torch.testing.assert_close(corrected[1], prediction[1])
+    error = corrected[0, 0] - target[0].log()
     assert float(error.mean()) == pytest.approx(0.0, abs=1e-6)
 
 
@@ -364,36 +366,36 @@ def training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **head: object) ->
     })  # fmt: skip
 
 
-def test_caches_know_gravity_and_what_they_teach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_caches_have_gravity_and_their_supervision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config, backbone = training(tmp_path, monkeypatch), tiny_backbone()
     planned = plan_caches(config, "given")
     caches = [fill_cache(plan, config, backbone) for plan in planned]
     assert [cache.supervision for cache in caches] == ["scale", "shape", "both"]
     np.testing.assert_allclose(
         caches[2].gravity[0], unit(0, 0.9, -0.1), atol=1e-6
-    )  # the plain view of the loft
+    )  # the unaugmented view of the loft
     field, depth = load_batch(caches[2], np.array([0]), "cpu")[3:]
     focal_px = torch.tensor([float(caches[2].focal_factor[0]) * CANONICAL_FOCAL_PX])
     torch.testing.assert_close(
         field, gravity_field(torch.from_numpy(caches[2].gravity[:1]), focal_px, 42, 56)
     )
     assert depth.shape == (1, 42, 56)
-    batch, teaches = load_mixed_batch(caches, np.array([[2, 0], [1, 4], [0, 3], [1, 0]]), "cpu")
-    assert teaches.tolist() == [[0, 1], [1, 0], [1, 0], [1, 1]]
+    batch, supervision = load_mixed_batch(caches, np.array([[2, 0], [1, 4], [0, 3], [1, 0]]), "cpu")
+    assert supervision.tolist() == [[0, 1], [1, 0], [1, 0], [1, 1]]
     torch.testing.assert_close(batch[3][3], field[0])
     torch.testing.assert_close(batch[0][1], load_batch(caches[1], np.array([0]), "cpu")[0][0])
     lying = config.model_copy(update={"view": config.view.model_copy(update={"upright": False})})
     assert not {plan.folder for plan in planned} & {plan.folder for plan in plan_caches(lying, "given")}
 
 
-def test_some_samples_are_not_told() -> None:
+def test_gravity_is_hidden_from_some_samples() -> None:
     torch.manual_seed(6)
     field = torch.ones(400, 4, 2, 2)
     batch = (torch.zeros(1), torch.zeros(1), torch.zeros(1), field, torch.zeros(1))
     config = HeadConfig(scale_dim=4, gravity=True, unknown_gravity=0.25)
-    told = hide_gravity(batch, config)[3]
-    assert bool((told.amin(dim=(1, 2, 3)) == told.amax(dim=(1, 2, 3))).all())
-    assert float(told.mean()) == pytest.approx(0.75, abs=0.08)
+    field_seen = hide_gravity(batch, config)[3]
+    assert bool((field_seen.amin(dim=(1, 2, 3)) == field_seen.amax(dim=(1, 2, 3))).all())
+    assert float(field_seen.mean()) == pytest.approx(0.75, abs=0.08)
     always, never = config.model_copy(update={"unknown_gravity": 0.0}), HeadConfig()
     torch.testing.assert_close(hide_gravity(batch, always)[3], field)
     assert hide_gravity(batch, never) is batch  # such a head does not read it

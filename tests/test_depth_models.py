@@ -94,7 +94,7 @@ def test_the_default_model_names_its_training_data() -> None:
     assert model.card == ModelCard("dinov2", DepthKind.METRIC, (238, 322), 280.0, "free", "six places")
     assert card_of(create_depth_model("sensor")) is None
     assert model_lines(model) == [
-        "dinov2: metric depth; learnt from 238x322 pixels of focal length 280 px",
+        "dinov2: metric depth; trained at 238x322 pixels of focal length 280 px",
         "weights head, sha256 ab; free; trained on six places",
     ]
     assert model_lines(create_depth_model("sensor")) == ["sensor: metric depth"]

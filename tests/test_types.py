@@ -110,7 +110,7 @@ def test_a_frame_must_fit_its_camera() -> None:
 DIRECTIONS = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
-def told_gravity(gravity: Any) -> Frame:
+def frame_with_gravity(gravity: Any) -> Frame:
     camera = Camera(4, 3, 5, 5, 1.5, 1)
     return Frame(7, 0.5, np.zeros((3, 4, 3), np.uint8), camera, gravity=gravity)
 
@@ -118,7 +118,7 @@ def told_gravity(gravity: Any) -> Frame:
 @given(DIRECTIONS, st.floats(0.991, 1.009))
 def test_a_frame_takes_a_unit_direction_of_gravity_as_it_is(direction: Any, length: float) -> None:
     gravity = np.array(direction) / np.linalg.norm(direction) * length
-    assert told_gravity(gravity).gravity is gravity
+    assert frame_with_gravity(gravity).gravity is gravity
 
 
 @given(DIRECTIONS, st.one_of(st.floats(0.0, 0.98), st.floats(1.02, 1e6), st.just(float("nan"))))
@@ -127,7 +127,7 @@ def test_a_frame_refuses_gravity_of_another_length(direction: Any, length: float
     with pytest.raises(
         CameraError, match=r"^frame 7: gravity must be a unit direction, its length is .*None$"
     ):
-        told_gravity(gravity)
+        frame_with_gravity(gravity)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ def test_a_frame_refuses_gravity_of_another_length(direction: Any, length: float
 )
 def test_what_is_no_direction_of_gravity(gravity: Any) -> None:
     with pytest.raises(CameraError, match="frame 7: gravity must be") as caught:
-        told_gravity(gravity)
+        frame_with_gravity(gravity)
     assert "\n" not in str(caught.value)
 
 
