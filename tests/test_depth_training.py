@@ -108,8 +108,8 @@ def test_features_are_computed_once(settings: dict[str, Any], monkeypatch: pytes
 
 
 def test_learning_happens(settings: dict[str, Any]) -> None:
-    plain = dict.fromkeys(("flip", "rolled", "colour", "blur", "noise", "jpeg", "max_tilt_deg"), 0.0)
-    view = {**settings["view"], "augment": {**plain, "upright_roll_deg": 0.0, "max_zoom": 1.0}}
+    unaugmented = dict.fromkeys(("flip", "rolled", "colour", "blur", "noise", "jpeg", "max_tilt_deg"), 0.0)
+    view = {**settings["view"], "augment": {**unaugmented, "upright_roll_deg": 0.0, "max_zoom": 1.0}}
     result = train({**settings, "members": 1, "coarse_epochs": 40, "fine_epochs": 0, "view": view,
                     "head": {**settings["head"], "dropout": 0.0}})  # fmt: skip
     assert result.losses[0, -1] < result.losses[0, 0] - 0.2

@@ -47,7 +47,7 @@ def segments(seed: int, count: int) -> np.ndarray:
 
 
 def drawn(ends: np.ndarray, R_world_camera: np.ndarray, camera: Camera) -> np.ndarray:
-    """Dark and pale lines on grey, bent as the camera's lens bends them."""
+    """Dark and pale lines on grey, distorted as by the lens of the camera."""
     image = np.full((camera.height, camera.width, 3), 128, np.uint8)
     width = max(1, round(camera.width / 320))
     along = np.linspace(0.0, 1.0, 60)[:, None]

@@ -61,9 +61,9 @@ def position_rmse(a: np.ndarray, b: np.ndarray) -> float:
 def test_exact_measurements_give_exact_poses(with_scale: bool) -> None:
     T = circle(24)
     edges = [*odometry(T), measured(T, 0, 23, is_loop=True)]
-    disturbed = T @ se3_exp(0.02 * np.random.default_rng(0).normal(size=(24, 6)))
-    disturbed[0] = T[0]
-    result = optimise_pose_graph(disturbed, edges, with_scale=with_scale)
+    perturbed = T @ se3_exp(0.02 * np.random.default_rng(0).normal(size=(24, 6)))
+    perturbed[0] = T[0]
+    result = optimise_pose_graph(perturbed, edges, with_scale=with_scale)
     np.testing.assert_allclose(result.T_world_camera, T, atol=1e-9)
     np.testing.assert_allclose(result.scales, 1.0, atol=1e-9)
     assert result.is_inlier.all()

@@ -14,7 +14,7 @@ from slamdepth.report import build_html, build_summary
 from slamdepth.report.axes import about_views, drawing_views, level_axes
 from slamdepth.report.plots import map_plot, trajectory_plot
 
-DOWN = np.array([0.0, 1.0, 0.0])
+GRAVITY_W = np.array([0.0, 1.0, 0.0])
 
 
 def test_a_table_seen_by_a_tipped_camera_is_level_from_the_side() -> None:
@@ -22,7 +22,7 @@ def test_a_table_seen_by_a_tipped_camera_is_level_from_the_side() -> None:
     table = np.column_stack([rng.uniform(-1, 1, 50), np.full(50, 0.7), rng.uniform(1, 3, 50)])
     for tipped in ([0.8, 0.0, 0.0], [0.5, 0.2, -0.4]):
         R_camera_level = so3_exp(np.array(tipped))
-        above, side = drawing_views(R_camera_level @ DOWN)
+        above, side = drawing_views(R_camera_level @ GRAVITY_W)
         seen = table @ R_camera_level.T
         np.testing.assert_allclose(side.flat(seen)[:, 1], -0.7, atol=1e-12)
         turned = above.flat(seen) - above.flat(seen).mean(axis=0)
@@ -37,7 +37,7 @@ def test_a_table_seen_by_a_tipped_camera_is_level_from_the_side() -> None:
 @pytest.mark.parametrize("pitch", [-1.57, -1.4, -0.7, 0.0, 0.7, 1.4, 1.57])
 def test_forward_is_where_the_first_camera_looks(pitch: float) -> None:
     R_camera_level = so3_exp(np.array([pitch, 0.0, 0.0]))
-    np.testing.assert_allclose(level_axes(R_camera_level @ DOWN), R_camera_level.T, atol=1e-12)
+    np.testing.assert_allclose(level_axes(R_camera_level @ GRAVITY_W), R_camera_level.T, atol=1e-12)
 
 
 def test_without_gravity_the_axes_are_the_first_cameras_and_named_so() -> None:
@@ -51,11 +51,11 @@ def test_without_gravity_the_axes_are_the_first_cameras_and_named_so() -> None:
 
 def test_the_report_says_which_axes_it_draws() -> None:
     data = full_data()
-    known = replace(data.reconstruction, gravity_w=DOWN)
+    known = replace(data.reconstruction, gravity_w=GRAVITY_W)
     for run in (data.reconstruction, known):
         page = build_html(replace(data, reconstruction=run), build_summary(data))
         assert ("from above (gravity-aligned)" in page) is (run is known)
         assert ("first camera's x–z" in page) is (run is not known)
         assert page.count(about_views(run.gravity_w)) == 2
     for draw in (map_plot, lambda run: trajectory_plot(run, data.trajectory_score)):
-        assert draw(known) != draw(replace(known, gravity_w=so3_exp(np.array([0.5, 0.0, 0.0])) @ DOWN))
+        assert draw(known) != draw(replace(known, gravity_w=so3_exp(np.array([0.5, 0.0, 0.0])) @ GRAVITY_W))

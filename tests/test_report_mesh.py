@@ -20,7 +20,7 @@ from slamdepth.report import MeshImage, build_html, build_summary, render_mesh_i
 from slamdepth.report.viewpoints import from_above, guessed_gravity, ideal_camera, over_the_shoulder
 from slamdepth.types import Trajectory
 
-DOWN = np.array([0.0, 1.0, 0.0])
+GRAVITY_W = np.array([0.0, 1.0, 0.0])
 CAMERA = ideal_camera(90, 60, 50.0)
 
 
@@ -45,58 +45,58 @@ def walk() -> np.ndarray:
     """Ten level cameras side by side that look at the wall, turned and tipped a little."""
     T = np.tile(np.eye(4), (10, 1, 1))
     T[:, 0, 3] = np.linspace(-0.5, 0.5, 10)
-    yaw = np.linspace(-0.5, 0.5, 10)[:, None] * DOWN
+    yaw = np.linspace(-0.5, 0.5, 10)[:, None] * GRAVITY_W
     T[:, :3, :3] = so3_exp(yaw) @ so3_exp(np.linspace(-0.2, -0.6, 10)[:, None] * [1.0, 0.0, 0.0])
     return T
 
 
-def room_run(gravity_w: np.ndarray | None = DOWN) -> Reconstruction:
+def room_run(gravity_w: np.ndarray | None = GRAVITY_W) -> Reconstruction:
     run = bare_data().reconstruction
     return replace(run, trajectory=Trajectory(np.arange(10.0), walk()), gravity_w=gravity_w)
 
 
 def test_from_above_all_is_in_the_image_and_the_eye_is_above_on_the_side_of_the_fronts() -> None:
     mesh, path = corner_room(), walk()[:, :3, 3]
-    for down in (DOWN, so3_exp(np.array([0.3, 0.0, 0.1])) @ DOWN):
-        T = from_above(mesh, path, down, CAMERA)
+    for gravity_w in (GRAVITY_W, so3_exp(np.array([0.3, 0.0, 0.1])) @ GRAVITY_W):
+        T = from_above(mesh, path, gravity_w, CAMERA)
         points = np.concatenate([mesh.vertices_m.astype(np.float64), path])
         px, z = project(CAMERA, transform(invert(T), points))
         inside = (z > 0) & (px > -0.5).all(axis=1) & (px < [89.5, 59.5]).all(axis=1)
         assert inside.mean() > 0.97
         assert inside[-len(path) :].all()
         assert np.ptp(px[:, 0]) > 60 or np.ptp(px[:, 1]) > 40  # and fills it
-        np.testing.assert_allclose(T[:3, 0] @ down, 0.0, atol=1e-12)
-        assert T[:3, 3] @ down < 0
+        np.testing.assert_allclose(T[:3, 0] @ gravity_w, 0.0, atol=1e-12)
+        assert T[:3, 3] @ gravity_w < 0
         assert T[2, 3] < 3.0
 
 
 def test_over_the_shoulder_is_a_step_behind_the_path_and_level() -> None:
-    T = over_the_shoulder(corner_room(), walk(), DOWN, CAMERA)
+    T = over_the_shoulder(corner_room(), walk(), GRAVITY_W, CAMERA)
     assert T is not None
     nearest = np.linalg.norm(walk()[:, :3, 3] - T[:3, 3], axis=1).min()
     assert 0.3 < nearest < 2.0
     assert T[2, 3] < 0
-    np.testing.assert_allclose(T[:3, 0] @ DOWN, 0.0, atol=1e-12)
-    straight_down = look_at(np.zeros(3), DOWN, np.array([0.0, 0.0, -1.0]))[None]
-    assert over_the_shoulder(corner_room(), straight_down, DOWN, CAMERA) is None
+    np.testing.assert_allclose(T[:3, 0] @ GRAVITY_W, 0.0, atol=1e-12)
+    straight_down = look_at(np.zeros(3), GRAVITY_W, np.array([0.0, 0.0, -1.0]))[None]
+    assert over_the_shoulder(corner_room(), straight_down, GRAVITY_W, CAMERA) is None
     away = walk() @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    assert over_the_shoulder(corner_room(), away, DOWN, CAMERA) is None
+    assert over_the_shoulder(corner_room(), away, GRAVITY_W, CAMERA) is None
 
 
 def test_gravity_is_guessed_from_cameras_that_were_held_level() -> None:
     R = so3_exp(np.array([0.7, 0.2, -0.3]))
     T = walk()
     T[:, :3, :3] = R @ T[:, :3, :3]
-    np.testing.assert_allclose(guessed_gravity(T), R @ DOWN, atol=1e-9)
-    assert walk()[:, :3, 1].mean(axis=0) @ DOWN < 0.96  # their y axes alone tell less
+    np.testing.assert_allclose(guessed_gravity(T), R @ GRAVITY_W, atol=1e-9)
+    assert walk()[:, :3, 1].mean(axis=0) @ GRAVITY_W < 0.96  # their y axes alone tell less
     still = np.tile(np.eye(4), (5, 1, 1))
-    np.testing.assert_allclose(guessed_gravity(still), DOWN)
+    np.testing.assert_allclose(guessed_gravity(still), GRAVITY_W)
     upside_down = np.stack([np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])])
-    np.testing.assert_allclose(guessed_gravity(upside_down), DOWN)
+    np.testing.assert_allclose(guessed_gravity(upside_down), GRAVITY_W)
 
 
 def test_two_images_say_what_they_know_of_gravity() -> None:
-    known, guessed = (render_mesh_images(corner_room(), room_run(gravity)) for gravity in (DOWN, None))
+    known, guessed = (render_mesh_images(corner_room(), room_run(gravity)) for gravity in (GRAVITY_W, None))
     assert len(known) == len(guessed) == 2
     assert "by gravity" in known[0].caption
     assert "guessed" in guessed[0].caption
