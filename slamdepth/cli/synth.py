@@ -18,6 +18,12 @@ def synth_command(
     fps: Annotated[float | None, typer.Option(metavar="HZ", help="Frame rate. Default: 30")] = None,
     width: Annotated[int | None, typer.Option(metavar="PX", help="Image width. Default: 640")] = None,
     height: Annotated[int | None, typer.Option(metavar="PX", help="Image height. Default: 480")] = None,
+    scene: Annotated[
+        str | None,
+        typer.Option(
+            metavar="room|aliased", help="A room, or a hall of identical workstations. Default: room"
+        ),
+    ] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Layout, colours, path. Default: 0")] = None,
     texture: Annotated[
         str | None, typer.Option(metavar="rich|low|bare", help="Amount of texture. Default: rich")
@@ -38,9 +44,11 @@ def synth_command(
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Render a furnished room along a looping path, in TUM layout.
+    """Render a furnished room, or a hall where places look alike, along a looping path, in TUM layout.
 
     Example: slamdepth synth demo/room --frames 300 --seed 1
+
+    Example: slamdepth synth demo/office --scene aliased --frames 600 --seed 1
 
     The same options give the same files. An interrupted rendering resumes where it stopped.
     """
@@ -50,9 +58,9 @@ def synth_command(
     from slamdepth.synth.sequence import SynthSettings, render_sequence
 
     asked = {
-        "frames": frames, "fps": fps, "width": width, "height": height, "seed": seed, "texture": texture,
-        "lighting_variation": lighting_variation, "noise": noise, "motion_blur": motion_blur,
-        "depth_noise": depth_noise,
+        "frames": frames, "fps": fps, "width": width, "height": height, "scene": scene, "seed": seed,
+        "texture": texture, "lighting_variation": lighting_variation, "noise": noise,
+        "motion_blur": motion_blur, "depth_noise": depth_noise,
     }  # fmt: skip
     settings = SynthSettings.from_dict(
         {name: value for name, value in asked.items() if value is not None}, origin="command line"

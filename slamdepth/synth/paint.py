@@ -235,3 +235,20 @@ def checker(first: Colour, second: Colour, size_m: float) -> Paint:
         return shaded(image.astype(np.float32), 0.05 * noise)
 
     return paint
+
+
+def tiles(colour: Colour, grout: Colour, across: int, down: int) -> Paint:
+    """``across`` by ``down`` tiles, each exactly like the others."""
+
+    def paint(rng: np.random.Generator, height: int, width: int, texel_m: float) -> Floats32:
+        rows, columns = max(2, round(height / down)), max(2, round(width / across))
+        vein = fractal(rng, rows, columns, texel_m, largest_m=0.25, octaves=5, stretch=(0.6, 1.6))
+        grain = fractal(rng, rows, columns, texel_m, largest_m=0.03, octaves=3, gain=0.9)
+        tile = shaded(flat(rows, columns, colour), 0.10 * vein + 0.05 * grain)
+        joint = max(1, round(0.004 / texel_m))
+        tile[:joint] = tile[-joint:] = tile[:, :joint] = tile[:, -joint:] = grout
+        row = ((np.arange(height) + 0.5) * down / height % 1.0 * rows).astype(int)
+        column = ((np.arange(width) + 0.5) * across / width % 1.0 * columns).astype(int)
+        return np.ascontiguousarray(tile[row][:, column])
+
+    return paint

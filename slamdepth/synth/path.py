@@ -53,9 +53,23 @@ def path_poses(phase: Floats, duration_s: float, seed: int) -> Floats:
         amplitude = min(np.radians(105.0), np.radians(25.0) * duration_s / (2.0 * np.pi) * 2.0) / 2.0
         yaw = start + amplitude * (1.0 - np.cos(angle))
     pitch = np.radians(-14.0) + np.radians(7.0) * np.sin(angle + 0.6) * small
-    roll = np.zeros_like(phase)
+    return hand_held(rng, position, yaw, pitch, angle, duration_s)
 
-    # Tremor: sums of whole harmonics, so the path still closes; about 0.5 to 1.5 Hz.
+
+def hand_held(
+    rng: np.random.Generator, position: Floats, yaw: Floats, pitch: Floats, angle: Floats, duration_s: float
+) -> Floats:
+    """Poses ``T_world_camera (N, 4, 4)`` of a camera in a trembling hand.
+
+    The tremor is a sum of whole harmonics of the path, of about 0.5 to 1.5 Hz, so a closed path stays closed.
+
+    Args:
+        position: ``(N, 3)`` metres, z up; not changed.
+        yaw, pitch: ``(N,)`` radians, about z from x, and up.
+        angle: ``(N,)`` where along the path, 0 to 2 pi.
+        duration_s: how long the whole path takes.
+    """
+    position, roll = position.copy(), np.zeros_like(angle)
     for axis, (size_m, size_rad) in enumerate([(0.004, 0.004), (0.004, 0.005), (0.005, 0.004)]):
         position[:, axis] += _tremor(rng, angle, duration_s, size_m)
         wobble = _tremor(rng, angle, duration_s, size_rad)
@@ -65,7 +79,7 @@ def path_poses(phase: Floats, duration_s: float, seed: int) -> Floats:
             pitch = pitch + wobble
         else:
             roll = roll + 2.0 * wobble
-    return _look(position, yaw, pitch, roll)
+    return look(position, yaw, pitch, roll)
 
 
 def _tremor(rng: np.random.Generator, angle: Floats, duration_s: float, size: float) -> Floats:
@@ -76,7 +90,7 @@ def _tremor(rng: np.random.Generator, angle: Floats, duration_s: float, size: fl
     return total
 
 
-def _look(position: Floats, yaw: Floats, pitch: Floats, roll: Floats) -> Floats:
+def look(position: Floats, yaw: Floats, pitch: Floats, roll: Floats) -> Floats:
     """Poses of cameras at ``position`` looking along yaw (about z, from x) and pitch (up)."""
     cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
     forward = np.stack([cy * cp, sy * cp, sp], axis=1)

@@ -40,17 +40,16 @@ class Renderer:
     def __init__(self, scene: Scene, camera: Camera, texel_m: float, seed: int) -> None:
         self._camera = camera
         solid = [surface for surface in scene.surfaces if surface.emission == 0]
-        light = bake(_raycaster(solid), scene.surfaces, scene.lamps, texel_m, seed)
-        self._atlas: Atlas = build_atlas(scene.surfaces, light, texel_m, seed)
+        painted, texture_of = _textures(scene.surfaces)
+        light = bake(_raycaster(solid), painted, scene.lamps, texel_m, seed)
+        self._atlas: Atlas = build_atlas(painted, light, texel_m, seed)
+        places = [self._atlas.places[texture] for texture in texture_of]
         self._raycaster = _raycaster(scene.surfaces)
         meshes = [surface.triangles for surface in scene.surfaces]
         self._corners = np.concatenate(
             [s.points.reshape(-1, 3)[t] for s, t in zip(scene.surfaces, meshes, strict=True)]
         )
-        texels = [
-            _texels(s, place)[t]
-            for s, place, t in zip(scene.surfaces, self._atlas.places, meshes, strict=True)
-        ]
+        texels = [_texels(s, place)[t] for s, place, t in zip(scene.surfaces, places, meshes, strict=True)]
         self._texels = np.concatenate(texels)
         self._surface_of = np.repeat(np.arange(len(meshes)), [len(t) for t in meshes]).astype(np.int32)
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
@@ -137,6 +136,22 @@ class Renderer:
         for ox, oy in taps:
             total += self._atlas.sample(u + ox * du_dx + oy * du_dy, v + ox * dv_dx + oy * dv_dy, level)
         return np.asarray(total / np.float32(len(taps)))
+
+
+def _textures(surfaces: list[Surface]) -> tuple[list[Surface], list[int]]:
+    """The surfaces that get a texture of their own, and for each surface the index of its texture."""
+    painted: list[Surface] = []
+    of_id: dict[str, int] = {}
+    texture_of = []
+    for surface in surfaces:
+        texture = of_id.get(surface.texture_id) if surface.texture_id is not None else None
+        if texture is None:
+            texture = len(painted)
+            painted.append(surface)
+            if surface.texture_id is not None:
+                of_id[surface.texture_id] = texture
+        texture_of.append(texture)
+    return painted, texture_of
 
 
 def _texels(surface: Surface, place: Place) -> Floats:

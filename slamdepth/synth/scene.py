@@ -51,21 +51,29 @@ def build_scene(seed: int, texture: str) -> Scene:
         *furniture.sofa(rng), *furniture.cabinet(rng), *furniture.rug_and_table(rng),
         *furniture.plant(rng), *furniture.corners(rng), *framed_prints(rng),
     ]  # fmt: skip
-    if texture == "low":
-        surfaces = [replace(s, paint=paint.muted(s.paint, 0.15)) if s.emission == 0 else s for s in surfaces]
     if texture == "bare":
         surfaces = [
             *shell(rng), *window(), *door(), *furniture.desk(rng), *furniture.sofa(rng),
             *furniture.cabinet(rng), *furniture.rug_and_table(rng), *furniture.corners(rng),
         ]  # fmt: skip
-        white = paint.plain((0.8, 0.8, 0.8), contrast=0.0)
-        surfaces = [replace(s, paint=white) if s.emission == 0 else s for s in surfaces]
+    surfaces = with_texture(surfaces, texture)
     lamps = [
         Lamp((2.5, 2.0, 2.50), (0.22, 0.0, 0.0), (0.0, 0.22, 0.0), (3.0, 2.75, 2.35)),
         Lamp((4.93, 2.0, 1.55), (0.0, 0.65, 0.0), (0.0, 0.0, 0.6), (3.4, 3.7, 4.2)),
         Lamp((0.45, 3.55, 1.60), (0.10, 0.0, 0.0), (0.0, 0.10, 0.0), (0.9, 0.7, 0.45)),
     ]
     return Scene(surfaces, lamps)
+
+
+def with_texture(surfaces: list[Surface], texture: str) -> list[Surface]:
+    """The surfaces with ``"rich"``, ``"low"`` or ``"bare"`` texture; what shines keeps its own."""
+    if texture == "rich":
+        return surfaces
+    white = paint.plain((0.8, 0.8, 0.8), contrast=0.0)
+    return [
+        s if s.emission else replace(s, paint=paint.muted(s.paint, 0.15) if texture == "low" else white)
+        for s in surfaces
+    ]
 
 
 def _toned(rng: np.random.Generator, colour: paint.Colour) -> paint.Colour:

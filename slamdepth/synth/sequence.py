@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The synthetic sequence: a furnished room in TUM layout with exact depth and poses."""
+"""The synthetic sequence: a furnished room or an aliased hall in TUM layout, with exact depth and poses."""
 
 from __future__ import annotations
 
@@ -40,6 +40,9 @@ class SynthSettings(BaseModel):
     fps: float = Field(30.0, gt=0, le=1000, description="frame rate in Hz")
     width: int = Field(640, ge=32, le=4096, description="image width in pixels")
     height: int = Field(480, ge=32, le=4096, description="image height in pixels")
+    scene: Literal["room", "aliased"] = Field(
+        "room", description="a furnished room, or a hall of identical workstations"
+    )
     seed: int = Field(0, ge=0, description="seed of layout, colours, path and noise")
     texture: Literal["rich", "low", "bare"] = Field("rich", description="amount of texture on surfaces")
     lighting_variation: float = Field(
@@ -103,14 +106,14 @@ def render_frames(settings: SynthSettings, indices: Iterable[int]) -> Iterator[t
 
 
 def make_renderer(settings: SynthSettings) -> Renderer:
-    """Build, paint and light the room of ``settings``."""
+    """Build, paint and light the scene of ``settings``."""
+    from slamdepth.synth.aliased import build_aliased_scene
     from slamdepth.synth.render import Renderer
     from slamdepth.synth.scene import build_scene
 
+    build = build_aliased_scene if settings.scene == "aliased" else build_scene
     texel_m = _TEXEL_AT_640_M * max(0.4, 640.0 / settings.width)
-    return Renderer(
-        build_scene(settings.seed, settings.texture), synth_camera(settings), texel_m, settings.seed
-    )
+    return Renderer(build(settings.seed, settings.texture), synth_camera(settings), texel_m, settings.seed)
 
 
 def render_frame(renderer: Renderer, settings: SynthSettings, index: int) -> tuple[Frame, Floats]:
@@ -184,6 +187,8 @@ def _render_sequence(
 def _claim(output: Path, settings: SynthSettings) -> None:
     """Prepare ``output`` for these settings, or raise OutputError if it holds something else."""
     record = {"scene_version": SCENE_VERSION, **settings.model_dump(mode="json")}
+    if settings.scene == "room":
+        del record["scene"]  # folders from before there were others go on
     record_file = output / SETTINGS_FILE
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file; name a folder for the sequence")
@@ -217,10 +222,12 @@ def _write_lists(output: Path, trajectory: Trajectory, camera: Camera) -> None:
 
 
 def _poses(settings: SynthSettings, index: Floats) -> Floats:
+    from slamdepth.synth.aliased_path import aliased_path_poses
     from slamdepth.synth.path import path_poses
 
     last = settings.frames - 1
-    return path_poses(index / last, last / settings.fps, settings.seed)
+    poses = aliased_path_poses if settings.scene == "aliased" else path_poses
+    return poses(index / last, last / settings.fps, settings.seed)
 
 
 def _photograph(colour: Floats32, settings: SynthSettings, index: int) -> NDArray[np.uint8]:

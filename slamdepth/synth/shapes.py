@@ -3,13 +3,13 @@
 
 A shape is one :class:`Surface` or a list of them. A surface is a grid of points ``(rows, columns, 3)`` in
 the world (z up, metres), visible from the side of its normals, with the rows running down its texture. Each
-has its own rectangle in the texture atlas.
+has its own rectangle in the texture atlas, unless it shares one by its ``texture_id``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,8 @@ class Surface:
         paint: makes its texture.
         emission: above 0, the patch emits its texture times this factor and is not lit.
         texel_scale: factor on the texel size, above 1 for surfaces with little detail.
+        texture_id: surfaces of one id look the same: they share the texture and the light of the first.
+            None is a texture of its own.
     """
 
     points: Floats
@@ -36,6 +38,7 @@ class Surface:
     paint: Paint
     emission: float = 0.0
     texel_scale: float = 1.0
+    texture_id: str | None = None
 
     @property
     def normals(self) -> Floats:
@@ -58,6 +61,14 @@ class Surface:
         upper = np.stack([a, c, b], axis=-1).reshape(-1, 3)
         lower = np.stack([b, c, d], axis=-1).reshape(-1, 3)
         return np.concatenate([upper, lower])
+
+
+def moved(
+    surfaces: Sequence[Surface], offset_m: tuple[float, float, float], *, half_turn: bool = False
+) -> list[Surface]:
+    """Copies of ``surfaces``, rotated by 180 degrees about the z axis if asked, then translated."""
+    turn = np.array([-1.0, -1.0, 1.0]) if half_turn else np.ones(3)
+    return [replace(surface, points=surface.points * turn + np.array(offset_m)) for surface in surfaces]
 
 
 def quad(
