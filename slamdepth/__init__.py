@@ -27,7 +27,9 @@ if TYPE_CHECKING:
         TrackingError,
         WeightsError,
     )
-    from slamdepth.evaluation import score_trajectory
+    from slamdepth.evaluation import AbsoluteError, RelativeError, TrajectoryScore, score_trajectory
+    from slamdepth.frontend.features import Features, ImageMatcher
+    from slamdepth.frontend.metric import DescriptorMetric
     from slamdepth.frontend.preparation import Prepared
     from slamdepth.io import read_tum_trajectory, write_tum_trajectory
     from slamdepth.mapping.keyframe import Keyframe
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     )
 
 _HOME = {
+    "AbsoluteError": "slamdepth.evaluation",
     "Camera": "slamdepth.types",
     "CameraError": "slamdepth.errors",
     "CloudTracker": "slamdepth.tracking",
@@ -58,16 +61,20 @@ _HOME = {
     "Dataset": "slamdepth.datasets",
     "DatasetError": "slamdepth.errors",
     "DepthKind": "slamdepth.types",
+    "DescriptorMetric": "slamdepth.frontend.metric",
     "DepthModel": "slamdepth.depth.base",
     "DepthPrediction": "slamdepth.types",
+    "Features": "slamdepth.frontend.features",
     "Frame": "slamdepth.types",
     "ImageDecodeError": "slamdepth.errors",
+    "ImageMatcher": "slamdepth.frontend.features",
     "InputError": "slamdepth.errors",
     "Keyframe": "slamdepth.mapping.keyframe",
     "Mesh": "slamdepth.mapping.mesh",
     "OutputError": "slamdepth.errors",
     "Prepared": "slamdepth.frontend.preparation",
     "Reconstruction": "slamdepth.mapping.reconstruction",
+    "RelativeError": "slamdepth.evaluation",
     "RunInterrupted": "slamdepth.pipeline",
     "RunProgress": "slamdepth.pipeline",
     "RunResult": "slamdepth.pipeline",
@@ -81,6 +88,7 @@ _HOME = {
     "TrackingError": "slamdepth.errors",
     "TrackingStatus": "slamdepth.types",
     "Trajectory": "slamdepth.types",
+    "TrajectoryScore": "slamdepth.evaluation",
     "WeightsError": "slamdepth.errors",
     "WeightsInfo": "slamdepth.types",
     "create_depth_model": "slamdepth.depth.registry",
@@ -93,6 +101,7 @@ _HOME = {
 }
 
 __all__ = [
+    "AbsoluteError",
     "Camera",
     "CameraError",
     "CloudTracker",
@@ -103,14 +112,18 @@ __all__ = [
     "DepthKind",
     "DepthModel",
     "DepthPrediction",
+    "DescriptorMetric",
+    "Features",
     "Frame",
     "ImageDecodeError",
+    "ImageMatcher",
     "InputError",
     "Keyframe",
     "Mesh",
     "OutputError",
     "Prepared",
     "Reconstruction",
+    "RelativeError",
     "RunInterrupted",
     "RunProgress",
     "RunResult",
@@ -124,6 +137,7 @@ __all__ = [
     "TrackingError",
     "TrackingStatus",
     "Trajectory",
+    "TrajectoryScore",
     "WeightsError",
     "WeightsInfo",
     "__version__",

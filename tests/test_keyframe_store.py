@@ -148,9 +148,9 @@ def test_the_depth_that_frame_and_prediction_share_is_written_once() -> None:
     one, two = SpillFile(), SpillFile()
     keyframe, frame = sensor_keyframe(0), sensor_keyframe(0).frame
     assert keyframe.prediction is not None
-    keyframe.prediction.spill(one, keyframe.frame)
-    keyframe.frame.spill(one)
-    frame.spill(two)
+    keyframe.prediction._spill(one, keyframe.frame)
+    keyframe.frame._spill(one)
+    frame._spill(two)
     assert one.size == two.size > 0
 
 

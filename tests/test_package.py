@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import re
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -41,6 +43,27 @@ def test_the_promised_names_are_public() -> None:
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'Traker'"):
         _ = slamdepth.Traker
+
+
+def public_functions() -> Iterator[tuple[str, Callable[..., object]]]:
+    """Public functions, and methods of public classes, by name."""
+    for name in slamdepth.__all__:
+        value = getattr(slamdepth, name)
+        if inspect.isfunction(value):
+            yield name, value
+        for attribute, member in vars(value).items() if isinstance(value, type) else ():
+            function = getattr(member, "fget", None) or getattr(member, "__func__", member)
+            if inspect.isfunction(function) and (attribute == "__init__" or not attribute.startswith("_")):
+                yield f"{name}.{attribute}", function
+
+
+def test_public_methods_take_and_return_public_types() -> None:
+    for name, function in public_functions():
+        for annotation in inspect.get_annotations(function).values():
+            for word in re.findall(r"\b[A-Z]\w+", str(annotation)):
+                kind = vars(sys.modules[function.__module__]).get(word)
+                if isinstance(kind, type) and kind.__module__.startswith("slamdepth."):
+                    assert word in slamdepth.__all__, f"{name} takes or returns {word}"
 
 
 def test_every_error_is_public() -> None:

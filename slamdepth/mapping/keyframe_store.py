@@ -51,7 +51,7 @@ class StoredFrame:
             self.index, self.timestamp_s, self._image.load(), self.camera, depth_m, gravity=self.gravity
         )
 
-    def spill(self, file: SpillFile) -> None:
+    def _spill(self, file: SpillFile) -> None:
         """Move the images to ``file``."""
         if (frame := self._resident) is None:
             return
@@ -96,7 +96,7 @@ class StoredPrediction:
             gravity_share=self.gravity_share,
         )
 
-    def spill(self, file: SpillFile, frame: StoredFrame) -> None:
+    def _spill(self, file: SpillFile, frame: StoredFrame) -> None:
         """Move the maps to ``file``.
 
         Args:
@@ -107,7 +107,7 @@ class StoredPrediction:
         if not prediction.is_sensor:
             self._values = file.spill(encode_half_precision(prediction.values))
         elif prediction.values is frame.load().depth_m:
-            frame.spill(file)
+            frame._spill(file)
             self._values = frame._depth
         else:
             self._values = file.spill(encode_sensor_depth(prediction.values, frame.camera.depth_factor))
@@ -160,8 +160,8 @@ class KeyframeStore:
         while self.resident_bytes > self._budget_bytes and self._spilled < len(keyframes) - _NEWEST:
             keyframe = keyframes[self._spilled]
             if keyframe.prediction is not None:
-                keyframe.prediction.spill(self._file, keyframe.frame)
-            keyframe.frame.spill(self._file)
+                keyframe.prediction._spill(self._file, keyframe.frame)
+            keyframe.frame._spill(self._file)
             self._spilled += 1
 
 
