@@ -73,7 +73,7 @@ def refused(camera: Camera) -> str | None:
 def real_cameras(draw: st.DrawFn) -> Camera:
     width, height = draw(st.integers(1, 10000)), draw(st.integers(1, 10000))
     focal = st.floats(0.8, 3.0).map(lambda share: share * max(width, height))
-    middle, weak = st.floats(0.4, 0.6), st.floats(0.0, 0.1)
+    middle, weak = st.floats(0.45, 0.55), st.floats(0.0, 0.1)
     return Camera(
         width, height, draw(focal), draw(focal), draw(middle) * width - 0.5, draw(middle) * height - 0.5,
         (draw(weak), draw(weak), draw(weak) / 100, -draw(weak) / 100, draw(weak)),
@@ -91,8 +91,42 @@ def test_round_trip_of_plausible_cameras(tmp_path: Path, camera: Camera) -> None
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        GOOD + "---\n",
+        GOOD + "...\n",
+        "---\n" + GOOD + "---\n---\n",
+        GOOD + "---\n" + GOOD,
+        GOOD.replace("500", "5e2").replace("501.5", "5015e-1"),
+        GOOD.replace("500", '"500"').replace("640", "'640'").replace("480", "480.0"),
+        GOOD + "distortion: []\n",
+        GOOD + "distortion:\n",
+        GOOD + 'distortion: ["0", 0e-5, 0.0, "0.0", 0]\n',
+    ],
+)
+def test_yaml_is_read_as_tools_write_it(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    notes: list[str] = []
+    assert Camera.from_file(path, notes) == Camera(640, 480, 500.0, 501.5, 320.0, 240.0)
+    assert notes == []
+
+
+@given(st.floats(1e-5, 0.1), st.sampled_from(["{:g}", "{:.17g}", "{:e}", '"{:e}"', "'{:g}'"]))
+def test_numbers_are_read_in_any_notation(
+    tmp_path_factory: pytest.TempPathFactory, value: float, form: str
+) -> None:
+    path = tmp_path_factory.mktemp("camera") / "camera.yaml"
+    text = form.format(value)
+    path.write_text(GOOD + f"distortion: [{text}, 0, 0, 0, 0]\n")
+    assert Camera.from_file(path).distortion[0] == float(text.strip("\"'"))
+
+
+@pytest.mark.parametrize(
     ("text", "what"),
     [
+        (GOOD + "---\n" + GOOD.replace("500", "600"), "holds 2 documents that differ; leave one camera"),
+        (GOOD + "---\nnothing\n", "holds 2 documents that differ"),
         (GOOD + "focal: 3\n", "unknown key 'focal'; allowed are width, height, fx, fy, cx, cy, distortion,"),
         (GOOD + "3: 3\n", "unknown key 3; allowed are width"),
         (GOOD.replace("fy: 501.5\n", ""), "key fy missing; needed are width, height, fx, fy, cx, cy"),
@@ -152,7 +186,7 @@ def test_garbage_is_a_camera_error(tmp_path: Path, data: bytes) -> None:
 def test_what_is_unusual_is_logged_unless_it_is_noted(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    write_camera(tmp_path / "wide.yaml", Camera(640, 480, 50.0, 50.0, 320.0, 240.0))
+    write_camera(tmp_path / "wide.yaml", Camera(640, 480, 100.0, 100.0, 320.0, 240.0))
     notes: list[str] = []
     Camera.from_file(tmp_path / "wide.yaml", notes)
     assert not caplog.records

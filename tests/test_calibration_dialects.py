@@ -144,6 +144,51 @@ def test_what_ros_writes_comes_back(
     assert camera.distortion == (*distortion, *[0.0] * (5 - len(distortion)))
 
 
+ECHO = """header:
+  seq: 12
+  stamp:
+    secs: 1403636579
+    nsecs: 763555584
+  frame_id: "camera"
+height: 480
+width: 640
+distortion_model: "plumb_bob"
+D: [-0.265, -0.0467, 0.0018, -3e-04, 0.252]
+K: [535.5, 0.0, 342.25, 0.0, 536.25, 235.5, 0.0, 0.0, 1.0]
+R: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+P: [536.0, 0.0, 342.0, 0.0, 0.0, 536.0, 235.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+binning_y: 0
+roi:
+  x_offset: 0
+  y_offset: 0
+  height: 0
+  width: 0
+  do_rectify: False
+---
+"""
+ECHO_OF_ROS_2 = (
+    "height: 480\nwidth: 640\ndistortion_model: plumb_bob\n"
+    "d:\n- -0.265\n- -0.0467\n- 0.0018\n- -3e-04\n- 0.252\n"
+    "k:\n- 535.5\n- 0.0\n- 342.25\n- 0.0\n- 536.25\n- 235.5\n- 0.0\n- 0.0\n- 1.0\nbinning_x: 0\n---\n"
+)
+
+
+@pytest.mark.parametrize(
+    "text", [ECHO, ECHO_OF_ROS_2, ECHO + ECHO.replace("seq: 12", "seq: 13") + ECHO, "---\n" + ECHO]
+)
+def test_a_printed_camera_info_is_read(tmp_path: Path, text: str) -> None:
+    assert read(tmp_path, text) == CAMERA
+
+
+@pytest.mark.parametrize("model", ["''", "plumb_bob", "None", "inverse_brown_conrady"])
+@pytest.mark.parametrize("coefficients", ["D: []", "D:", "D: [0.0, 0.0, 0.0, 0.0, 0.0]", "binning_y: 0"])
+def test_no_distortion_needs_no_model(tmp_path: Path, model: str, coefficients: str) -> None:
+    text = ECHO.replace("binning_y: 0\n", "").replace('"plumb_bob"', model)
+    text = text.replace("D: [-0.265, -0.0467, 0.0018, -3e-04, 0.252]", coefficients)
+    assert read(tmp_path, text) == CAMERA.without_distortion()
+
+
 def ros(what: str, by: str) -> str:
     assert what in ROS
     return ROS.replace(what, by)
@@ -164,6 +209,10 @@ def test_coefficients_that_are_zero_may_follow(tmp_path: Path) -> None:
         (ros("plumb_bob", "equidistant"), "a lens of the model 'equidistant' is not supported"),
         (OPENCV + "fisheye_model: 1\n", "a lens of the model 'fisheye' is not supported"),
         (ros(FIVE, EIGHT.format(0.1)), "key 'distortion_coefficients' has 8 coefficients; supported are"),
+        (ECHO.replace('"plumb_bob"', "''"), "a lens of the model '' is not supported"),
+        (ECHO.replace('"plumb_bob"', "equidistant").replace("D: [-0.265", "D: [0"), "'equidistant' is not"),
+        (ECHO[: ECHO.index("K: ")] + "K: [0, 0, 0, 0, 0, 0, 0, 0, 0]\n", "all zero: this camera was never"),
+        (ECHO + ECHO.replace("535.5", "600.0"), "holds 2 documents that differ"),
         (ros("image_height: 480\n", ""), "a calibration without image_height: add the size"),
         (ros("image_height: 480\n", "height: no\n"), "key 'height' must be a whole number of pixels"),
         (ros("image_height: 480\n", "image_height: 480\nheight: 240\n"), "'image_height' and 'height' say"),

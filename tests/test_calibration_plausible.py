@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,73 @@ def test_what_no_camera_has(camera: Camera, says: str) -> None:
         check_plausible(camera)
 
 
+def at(width: int, height: int, fx: float, cx: float, cy: float, fy: float | None = None) -> Camera:
+    return Camera(width, height, fx, fx if fy is None else fy, cx, cy)
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        (
+            at(640, 480, 1050, 639.5, 479.5),
+            "fits an image of about 1280x960, not 640x480: the intrinsics are",
+        ),
+        (at(640, 480, 262.5, 159.5, 119.5), "fits an image of about 320x240, not 640x480"),
+        (at(640, 480, 1000, 639.5, 359.5), "fits an image of about 1280x720, not 640x480"),
+        (at(1280, 720, 525, 319.5, 239.5), "fits an image of about 640x480, not 1280x720"),
+        (at(1920, 1080, 900, 639.5, 359.5), "fits an image of about 1280x720, not 1920x1080"),
+        (at(640, 480, 525, 319.5, 60), "fits an image of about 640x121"),
+        (at(640, 480, 525, 0, 0), "at the edge of the image, .* about 319.5 239.5: was it never set"),
+        (at(640, 480, 525, 0, 239.5), "at the edge of the image, .*: was it never set"),
+        (at(640, 480, 525, 0.5, 0.5), "at the edge of the image, .*: is it normalised"),
+        (at(640, 480, 3.637, 319.5, 239.5), "fx 3.637 is a view of 179 degrees .* is it in millimetres"),
+        (at(640, 480, 525, 319.5, 239.5, 3.6), "fy 3.6 is a view of 178 degrees .* millimetres"),
+        (at(640, 480, 50, 319.5, 239.5), "fx 50 is a view of 162 degrees .* millimetres"),
+        (at(640, 480, 0.82, 0.5, 0.5, 1.09), "Multiply fx and cx by the width 640"),
+        (at(640, 480, 1.5, 0.0, 0.0), "are they normalised"),
+    ],
+)
+def test_intrinsics_of_another_size_or_unit_are_refused_with_the_likely_reason(
+    camera: Camera, says: str
+) -> None:
+    with pytest.raises(CameraError, match=says):
+        check_plausible(camera)
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        (at(640, 480, 525, 319.5, 150), "fits an image of about 640x301, not 640x480: unless the images are"),
+        (at(640, 480, 656, 399.5, 299.5), "fits an image of about 800x600"),
+        (at(800, 600, 525, 319.5, 239.5), "fits an image of about 640x480"),
+        (at(640, 480, 525, 239.5, 319.5), "fits an image of about 480x640"),
+        (at(640, 480, 3637, 319.5, 239.5), "only 10.1 degrees .* in micrometres"),
+    ],
+)
+def test_what_may_be_right_is_noted(camera: Camera, says: str) -> None:
+    (note,) = check_plausible(camera)
+    assert re.search(says, note)
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.floats(0.2, 5.0), st.sampled_from([(640, 480), (1280, 720), (752, 480), (480, 640)]))
+def test_intrinsics_of_another_size_never_pass_in_silence(factor: float, size: tuple[int, int]) -> None:
+    """Of an image an eighth smaller or larger and beyond; of about the same size they do."""
+    width, height = size
+    own = Camera(width, height, 0.8 * width, 0.8 * width, (width - 1) / 2, (height - 1) / 2)
+    wrong = Camera(
+        width, height, factor * own.fx, factor * own.fy,
+        factor * (own.cx + 0.5) - 0.5, factor * (own.cy + 0.5) - 0.5,
+    )  # fmt: skip
+    try:
+        notes = check_plausible(wrong)
+    except CameraError:
+        assert not 0.8 < factor < 1.2
+        return
+    assert 0.75 < factor < 1.3
+    assert bool(notes) or 0.87 < factor < 1.13
+
+
 def test_the_radius_of_the_fold_is_the_largest_the_lens_reaches() -> None:
     assert fold_radius(PLAIN) == math.inf
     assert fold_radius(with_distortion(-0.4, 0, 0, 0, 0)) == pytest.approx(math.sqrt(1 / 1.2) * 2 / 3)
@@ -91,14 +159,14 @@ def test_any_numbers_are_plausible_or_refused(distortion: tuple[float, ...]) -> 
 
 
 def test_a_very_wide_view_is_noted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    wide = Camera(640, 480, 52.5, 52.5, 319.5, 239.5)
-    assert horizontal_view_deg(wide) == pytest.approx(2 * math.degrees(math.atan(320 / 52.5)))
+    wide = Camera(640, 480, 105.0, 105.0, 319.5, 239.5)
+    assert horizontal_view_deg(wide) == pytest.approx(2 * math.degrees(math.atan(320 / 105.0)))
     assert check_plausible(Camera(640, 480, 190.0, 190.0, 319.5, 239.5)) == []
     path = tmp_path / "camera.yaml"
     write_camera(path, wide)
     with caplog.at_level(logging.WARNING, logger="slamdepth"):
         assert Camera.from_file(path) == wide
-    said = "camera.yaml: fx 52.5 is a horizontal view of 161 degrees in an image 640 pixels wide"
+    said = "camera.yaml: fx 105 is a horizontal view of 144 degrees in an image 640 pixels wide"
     assert said in caplog.text
     write_camera(make_sevenscenes(tmp_path / "inside") / "camera.yaml", wide)
     for dataset in (

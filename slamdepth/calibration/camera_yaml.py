@@ -13,7 +13,8 @@
     depth_factor: 5000.0                    # raw units per metre; may be absent
     fps: 30.0                               # may be absent
 
-Files of OpenCV's and ROS's calibration are read too (:mod:`slamdepth.calibration.dialects`).
+Numbers may be quoted or have an exponent without a dot, and a ``---`` or ``...`` may end the file. Files of
+OpenCV's and ROS's calibration are read too (:mod:`slamdepth.calibration.dialects`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,13 @@ from typing import Any, TypeVar
 
 import yaml
 
-from slamdepth.calibration.dialects import CalibrationLoader, as_yaml, is_calibration, translated
+from slamdepth.calibration.dialects import (
+    CalibrationLoader,
+    as_yaml,
+    is_calibration,
+    number_of,
+    translated,
+)
 from slamdepth.calibration.plausible import Pinhole, check_plausible
 from slamdepth.errors import CameraError
 
@@ -121,12 +128,13 @@ def _load(path: Path) -> dict[Any, Any]:
     try:
         text = as_yaml(path.read_bytes().decode("utf-8-sig"))
         # Loading would let the last of two equal keys win without a word.
-        tree = yaml.compose(text, Loader=CalibrationLoader)
-        values = yaml.load(text, Loader=CalibrationLoader)
+        trees = [tree for tree in yaml.compose_all(text, Loader=CalibrationLoader) if not _is_empty(tree)]
+        documents = [value for value in yaml.load_all(text, Loader=CalibrationLoader) if value is not None]
     except OSError as error:
         raise CameraError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: bad UTF-8, a 13th month
         raise CameraError(f"{path}: not valid YAML: {_where_and_why(error)}") from error
+    tree, values = (trees[0], documents[0]) if trees and documents else (None, None)
     if not isinstance(values, dict) or not isinstance(tree, yaml.MappingNode):
         raise CameraError(f"{path}: expected lines 'key: value' with the keys {', '.join(REQUIRED_KEYS)}")
     for mapping in (tree, *(value for _, value in tree.value if isinstance(value, yaml.MappingNode))):
@@ -134,7 +142,19 @@ def _load(path: Path) -> dict[Any, Any]:
         for name in names:
             if names.count(name) > 1:
                 raise CameraError(f"{path}: key {name!r} is given twice")
+    for other in documents[1:]:
+        if not isinstance(other, dict) or not _of_camera(other).items() <= _of_camera(values).items():
+            raise CameraError(f"{path}: holds {len(documents)} documents that differ; leave one camera in it")
     return values
+
+
+def _is_empty(tree: yaml.Node | None) -> bool:
+    return tree is None or (isinstance(tree, yaml.ScalarNode) and tree.tag.endswith(":null"))
+
+
+def _of_camera(values: dict[Any, Any]) -> dict[Any, Any]:
+    """``values`` without the header of a message, which has its time and number."""
+    return {key: value for key, value in values.items() if key != "header"}
 
 
 def _where_and_why(error: Exception) -> str:
@@ -148,22 +168,27 @@ def _plural(names: list[str]) -> str:
 
 
 def _number(path: Path, key: str, value: Any) -> float:
-    # bool is an int to Python, and '1e3' without a dot a text to YAML 1.1.
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise CameraError(f"{path}: key {key!r} must be a number such as 500.0, found {value!r}")
     try:
-        return float(value)
+        return number_of(value)
     except OverflowError as error:
         raise CameraError(f"{path}: key {key!r} is out of range") from error
+    except ValueError as error:
+        raise CameraError(f"{path}: key {key!r} must be a number such as 500.0, found {value!r}") from error
 
 
 def _whole(path: Path, key: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise CameraError(f"{path}: key {key!r} must be a whole number of pixels, found {value!r}")
-    return value
+    try:
+        number = number_of(value)
+        if number != int(number):
+            raise ValueError(value)
+        return int(number)
+    except (ValueError, OverflowError) as error:
+        raise CameraError(f"{path}: key {key!r} must be a whole number of pixels, found {value!r}") from error
 
 
 def _distortion(path: Path, value: Any) -> tuple[float, ...]:
+    if value is None or value == []:
+        return (0.0,) * 5
     if not isinstance(value, list) or len(value) != 5:
         raise CameraError(
             f"{path}: key 'distortion' must be five numbers [k1, k2, p1, p2, k3], found {value!r}"

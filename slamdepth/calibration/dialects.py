@@ -3,7 +3,8 @@
 
 OpenCV's ``FileStorage`` writes ``camera_matrix: !!opencv-matrix {rows, cols, dt, data}`` below a line
 ``%YAML:1.0``, ROS ``camera_matrix: {rows, cols, data}`` and a ``distortion_model``; names differ a little
-from tool to tool. Pixels have integer centres in both, as here.
+from tool to tool, and a printed ``camera_info`` has ``K`` and ``D`` or ``k`` and ``d``. Pixels have integer
+centres in all, as here.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ _NAMES = {
 }
 """What is read, and its names in lower case without underscores."""
 
-_BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "brown_conrady")
+_BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "radial_tangential", "brown_conrady")
+_UNNAMED = ("", "none", "pinhole", "inverse_brown_conrady", "modified_brown_conrady")
+"""Models that drivers name for images without distortion; taken where all coefficients are zero."""
 _SKEW_SHARE = 1e-6
 
 
@@ -64,6 +67,8 @@ def translated(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
     fx, skew, cx, _, fy, cy, *last = _matrix(path, keys["matrix"], values[keys["matrix"]])
     if abs(skew) > _SKEW_SHARE * abs(fx):
         raise CameraError(f"{path}: key {keys['matrix']!r} has a skew of {skew:g}: calibrate without")
+    if not any((fx, fy, cx, cy)):
+        raise CameraError(f"{path}: key {keys['matrix']!r} is all zero: this camera was never calibrated")
     if last != [0.0, 0.0, 1.0]:
         raise CameraError(f"{path}: key {keys['matrix']!r} must be [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
     _check_model(path, keys, values)
@@ -97,7 +102,10 @@ def _check_model(path: Path, keys: dict[str, Any], values: dict[Any, Any]) -> No
     model = values[keys["model"]] if "model" in keys else "plumb_bob"
     if "fisheye" in keys and values[keys["fisheye"]]:
         model = "fisheye"
-    if str(model).lower().replace("-", "_") not in _BROWN_CONRADY:
+    name = str(model or "").lower().replace("-", "_")
+    if name in _UNNAMED and not any(_distortion(path, keys, values)):
+        return
+    if name not in _BROWN_CONRADY:
         raise CameraError(
             f"{path}: a lens of the model {str(model)[:40]!r} is not supported, only a pinhole with "
             "[k1, k2, p1, p2, k3] (plumb_bob): calibrate with that model, or undistort the images first"
@@ -111,7 +119,7 @@ def _distortion(path: Path, keys: dict[str, Any], values: dict[Any, Any]) -> lis
             raise CameraError(f"{path}: key {like[0]!r} is not known; write 'distortion_coefficients'")
         return [0.0] * 5
     key = keys["distortion"]
-    numbers = _numbers(path, key, values[key])
+    numbers = _numbers(path, key, [] if values[key] is None else values[key])
     if any(numbers[5:]):
         raise CameraError(
             f"{path}: key {key!r} has {len(numbers)} coefficients; supported are [k1, k2, p1, p2, k3]: "
@@ -143,12 +151,22 @@ def _numbers(path: Path, key: Any, value: Any) -> list[float]:
     return [_number(path, key, number) for number in flat]
 
 
+def number_of(value: Any) -> float:
+    """A number of a YAML file, also where it is quoted or, as ``1e-05``, a text to YAML 1.1.
+
+    Raises:
+        ValueError: it is none.
+        OverflowError: it is beyond any float.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise ValueError(value)
+    if isinstance(value, str) and "_" in value:  # Python's 1_000, which no calibration means
+        raise ValueError(value)
+    return float(value)
+
+
 def _number(path: Path, key: Any, value: Any) -> float:
     try:
-        if isinstance(value, bool) or not isinstance(value, int | float | str):
-            raise ValueError
-        if isinstance(value, str) and "_" in value:  # Python's 1_000, which no calibration means
-            raise ValueError
-        return float(value)  # also of text: '1e-05' is one to YAML 1.1
+        return number_of(value)
     except (ValueError, OverflowError) as error:
         raise CameraError(f"{path}: key {key!r} must hold numbers, found {str(value)[:40]!r}") from error

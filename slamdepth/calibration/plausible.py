@@ -18,6 +18,22 @@ if TYPE_CHECKING:
 
 WIDE_VIEW_DEG = 120.0
 """Wider than a pinhole camera with Brown-Conrady distortion usually sees."""
+WIDEST_VIEW_DEG = 150.0
+"""Wider than such a camera can see: a focal length that gives more is not in pixels."""
+NARROW_VIEW_DEG = 12.0
+"""Narrower than the camera of a phone, a robot or a car sees; a telephoto lens may."""
+
+_USUAL_CENTRE = (0.38, 0.62)
+"""Principal points of real lenses, as a share of the image's side; others are noted."""
+_USUAL_BOTH = (0.44, 0.56)
+"""The same where it is off the middle alike in both directions, as that of another image size is."""
+_OF_ANOTHER_SIZE = (0.39, 0.63)
+"""Shares beyond which a principal point that is off the middle alike in both directions is refused."""
+_FAR_CENTRE = (0.36, 0.64)
+"""Shares beyond which one that is off in both directions, but not alike, is refused."""
+_FARTHEST_CENTRE = (0.15, 0.85)
+"""Shares beyond which one that is off in one direction is refused, also for a cropped image."""
+_ALIKE = 0.05
 
 _UNDONE_SHARE = 0.05
 """Largest error of undistorting and distorting a pixel, as a share of the longer side: 0.2 % for real
@@ -64,16 +80,24 @@ def check_plausible(camera: Pinhole) -> list[str]:
         What is unusual about them, one line each.
 
     Raises:
-        CameraError: the principal point lies outside the image, or the distortion folds it or cannot be
-            undone; the message does not name the file.
+        CameraError: the focal lengths are not in pixels, the principal point is at 0, outside the image or
+            that of another image size, or the distortion folds the image or cannot be undone; the message
+            does not name the file.
     """
-    _check_principal_point(camera)
-    notes = _check_distortion(camera)
+    _check_focal_lengths(camera)
+    notes = [*_check_principal_point(camera), *_check_distortion(camera)]
     view_deg = horizontal_view_deg(camera)
     if view_deg > WIDE_VIEW_DEG:
         notes.append(
             f"fx {camera.fx:g} is a horizontal view of {view_deg:.0f} degrees in an image {camera.width} "
             "pixels wide: if the camera sees less, fx, fy, cx and cy are of images of another size"
+        )
+    widest_deg = max(_view_deg(camera.width, camera.fx), _view_deg(camera.height, camera.fy))
+    if widest_deg < NARROW_VIEW_DEG:
+        notes.append(
+            f"fx {camera.fx:g} and fy {camera.fy:g} are a view of only {widest_deg:.1f} degrees in an image "
+            f"of {camera.width}x{camera.height}: if the camera sees more, they are of larger images or in "
+            "micrometres"
         )
     return notes
 
@@ -82,6 +106,11 @@ def horizontal_view_deg(camera: Pinhole) -> float:
     """Angle between the image's left and right edge in degrees, distortion left out."""
     left, right = (camera.cx + 0.5) / camera.fx, (camera.width - 0.5 - camera.cx) / camera.fx
     return math.degrees(math.atan(left) + math.atan(right))
+
+
+def _view_deg(size: int, focal: float) -> float:
+    """Angle that an image side of ``size`` pixels sees with the principal point in its middle."""
+    return 2.0 * math.degrees(math.atan(size / (2.0 * focal)))
 
 
 def fold_radius(camera: Pinhole) -> float:
@@ -98,7 +127,35 @@ def fold_radius(camera: Pinhole) -> float:
     return math.sqrt(r2) * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
 
 
-def _check_principal_point(camera: Pinhole) -> None:
+def _check_focal_lengths(camera: Pinhole) -> None:
+    for name, focal, centre, size, side in (
+        ("fx", camera.fx, "cx", camera.width, "width"),
+        ("fy", camera.fy, "cy", camera.height, "height"),
+    ):
+        view_deg = _view_deg(size, focal)
+        if view_deg <= WIDEST_VIEW_DEG:
+            continue
+        if focal < 3.0 and max(camera.cx, camera.cy) <= 1.5:
+            reason = f"are they normalised? Multiply {name} and {centre} by the {side} {size}"
+        else:
+            reason = (
+                f"is it in millimetres? In pixels it is {focal:g} * {size} / (the sensor's {side} in "
+                "millimetres)"
+            )
+        raise CameraError(
+            f"{name} {focal:g} is a view of {view_deg:.0f} degrees in an image whose {side} is {size}, but "
+            f"focal lengths are in pixels: {reason}"
+        )
+
+
+def _check_principal_point(camera: Pinhole) -> list[str]:
+    """Refuse a principal point that no image of this size has; return what is unusual about it."""
+    if -0.5 <= min(camera.cx, camera.cy) <= 1.5 and min(camera.width, camera.height) > 8:
+        reason = "was it never set?" if 0.0 in (camera.cx, camera.cy) else "is it normalised?"
+        raise CameraError(
+            f"cx {camera.cx:g}, cy {camera.cy:g} is at the edge of the image, but the principal point is a "
+            f"pixel near the middle, about {(camera.width - 1) / 2:g} {(camera.height - 1) / 2:g}: {reason}"
+        )
     for name, value, size, side in (
         ("cx", camera.cx, camera.width, "width"),
         ("cy", camera.cy, camera.height, "height"),
@@ -108,6 +165,27 @@ def _check_principal_point(camera: Pinhole) -> None:
                 f"{name} {value:g} lies outside the image, whose {side} is {size}: the principal point is a "
                 "pixel near its middle; are the intrinsics of images of another size?"
             )
+    shares = ((camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height)
+    alike = abs(shares[0] - shares[1]) < _ALIKE
+    both_off = max(shares) < _USUAL_BOTH[0] or min(shares) > _USUAL_BOTH[1]
+    if all(_is_within(share, _USUAL_CENTRE) for share in shares) and not (alike and both_off):
+        return []
+    found = (
+        f"the principal point cx {camera.cx:g}, cy {camera.cy:g} fits an image of about "
+        f"{2 * camera.cx + 1:.0f}x{2 * camera.cy + 1:.0f}, not {camera.width}x{camera.height}"
+    )
+    low, high = _OF_ANOTHER_SIZE if alike else _FAR_CENTRE
+    is_near = all(_is_within(share, _FARTHEST_CENTRE) for share in shares)
+    if not is_near or max(shares) < low or min(shares) > high:
+        raise CameraError(
+            f"{found}: the intrinsics are of images of another size; multiply fx, fy, cx and cy by the ratio "
+            "of the sizes, or calibrate with these images"
+        )
+    return [f"{found}: unless the images are cropped, these intrinsics and the result are wrong"]
+
+
+def _is_within(value: float, limits: tuple[float, float]) -> bool:
+    return limits[0] <= value <= limits[1]
 
 
 def _check_distortion(camera: Pinhole) -> list[str]:
