@@ -12,8 +12,10 @@ from slamdepth.cli.console import QuietOption, VerboseOption, console, show_log
 
 
 def evaluate_command(
-    ground_truth: Annotated[Path, typer.Argument(metavar="GROUNDTRUTH", help="TUM trajectory file.")],
-    estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help="TUM trajectory file.")],
+    ground_truth: Annotated[
+        Path, typer.Argument(metavar="GROUNDTRUTH", help="Trajectory file: TUM, or EuRoC with its header.")
+    ],
+    estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help="Trajectory file of the same kinds.")],
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="FILE", help="Also write the figures here, as JSON."),
@@ -29,14 +31,16 @@ def evaluate_command(
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compare two TUM trajectory files: ATE and RPE, equal to those of evo's own commands.
+    """Compare two trajectory files: ATE and RPE, equal to those of evo's own commands.
+
+    Times in milliseconds, microseconds or nanoseconds are converted, with a note.
 
     Example: slamdepth evaluate desk/groundtruth.txt runs/desk/trajectory.txt --output score.json
     """
     show_log()
-    from slamdepth.errors import ConfigError
+    from slamdepth.errors import ConfigError, DatasetError
     from slamdepth.evaluation import MAX_DIFFERENCE_S, score_trajectory
-    from slamdepth.io import read_tum_trajectory, writable_file, write_json
+    from slamdepth.io import read_trajectory_pair, writable_file, write_json
     from slamdepth.report import trajectory_table
 
     for name, value in (("--max-difference", max_difference), ("--fps", fps)):
@@ -44,16 +48,18 @@ def evaluate_command(
             raise ConfigError(f"{name} must be positive and finite, got {value:g}")
     if output is not None:
         output = writable_file(output, ".json")
-    truth, truth_notes = read_tum_trajectory(ground_truth)
-    estimated, estimate_notes = read_tum_trajectory(estimate)
-    score = score_trajectory(
-        truth,
-        estimated,
-        max_difference_s=MAX_DIFFERENCE_S if max_difference is None else max_difference,
-        fps=fps,
-    )
-    figures = score.to_dict()
+    (truth, truth_notes), (estimated, estimate_notes) = read_trajectory_pair(ground_truth, estimate)
     notes = [*truth_notes, *estimate_notes]
+    try:
+        score = score_trajectory(
+            truth,
+            estimated,
+            max_difference_s=MAX_DIFFERENCE_S if max_difference is None else max_difference,
+            fps=fps,
+        )
+    except DatasetError as error:
+        raise DatasetError("; ".join([str(error), *notes])) from error
+    figures = score.to_dict()
     if output is not None:
         write_json(output, {**figures, "notes": notes})
     out = console()

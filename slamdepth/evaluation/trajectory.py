@@ -260,9 +260,19 @@ def _poses_per_second(trajectory: Trajectory) -> float:
 
 def _overlap_hint(ground_truth: Trajectory, estimate: Trajectory) -> str:
     a, b = ground_truth.timestamps_s, estimate.timestamps_s
+    advice = "check that both belong to the same recording"
+    spans = float(np.ptp(a)), float(np.ptp(b))
+    if min(spans) > 0:
+        ratio, offset_s = max(spans) / min(spans), float(abs(a[0] - b[0]))
+        places = next((n for n in (3, 6, 9) if 0.5 < ratio / 10**n < 2.0), None)
+        if places is not None:
+            which = "ground truth" if spans[0] > spans[1] else "estimate"
+            advice += f"; the times of the {which} span about 1e{places} times the other's: are both seconds?"
+        elif offset_s > sum(spans):
+            advice += f"; their clocks start {offset_s:.3f} s apart"
     return (
         f" (ground truth from {a[0]:.3f} to {a[-1]:.3f} s, estimate from {b[0]:.3f} to {b[-1]:.3f} s): "
-        "check that both belong to the same recording"
+        f"{advice}"
     )
 
 

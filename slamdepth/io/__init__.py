@@ -16,12 +16,8 @@ from slamdepth.io.images import (
 from slamdepth.io.outputs import writable, writable_file
 from slamdepth.io.ply import encode_ply, write_point_cloud
 from slamdepth.io.text import parse_float, read_lines, replacing, write_json, write_text
-from slamdepth.io.trajectory import (
-    TrajectoryWriter,
-    format_timestamp,
-    read_tum_trajectory,
-    write_tum_trajectory,
-)
+from slamdepth.io.trajectory import TrajectoryWriter, format_timestamp, write_tum_trajectory
+from slamdepth.io.trajectory_reader import read_trajectory_pair, read_tum_trajectory
 
 __all__ = [
     "TrajectoryWriter",
@@ -32,6 +28,7 @@ __all__ = [
     "read_depth_raw",
     "read_image_rgb",
     "read_lines",
+    "read_trajectory_pair",
     "read_tum_trajectory",
     "replacing",
     "sha256_of",

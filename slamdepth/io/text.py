@@ -28,13 +28,24 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
     Raises:
         DatasetError: the file cannot be read.
     """
+    return [(number, line) for number, line in read_commented_lines(path) if not line.startswith("#")]
+
+
+def read_commented_lines(path: Path) -> list[tuple[int, str]]:
+    """The lines of a list file and its ``#`` comments, with their numbers from 1.
+
+    A byte order mark, CRLF and blank lines are taken out; lines come stripped.
+
+    Raises:
+        DatasetError: the file cannot be read.
+    """
     try:
         text = path.read_bytes().decode("utf-8-sig", errors="replace")
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
     # Not str.splitlines: it also breaks at form feeds and the like, and editors don't count those.
     stripped = ((number, line.strip()) for number, line in enumerate(re.split(r"\r\n|\r|\n", text), 1))
-    return [(number, line) for number, line in stripped if line and not line.startswith("#")]
+    return [(number, line) for number, line in stripped if line]
 
 
 def parse_float(text: str) -> float:

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TUM trajectory files: ``timestamp tx ty tz qx qy qz qw``, camera to world.
-
-Quaternions are x y z w with w >= 0 when written.
-"""
+"""Writing of TUM trajectory files: ``timestamp tx ty tz qx qy qz qw``, camera to world, w >= 0."""
 
 from __future__ import annotations
 
@@ -15,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.errors import DatasetError, OutputError
-from slamdepth.io.text import parse_float, read_lines, write_text
+from slamdepth.errors import OutputError
+from slamdepth.io.text import write_text
 from slamdepth.types import Trajectory
 
 if TYPE_CHECKING:
@@ -25,56 +22,6 @@ if TYPE_CHECKING:
 TUM_HEADER = "# timestamp_s tx ty tz qx qy qz qw (metres, camera to world)\n"
 
 _FSYNC_EVERY_S = 1.0
-
-
-def read_tum_trajectory(path: str | Path) -> tuple[Trajectory, list[str]]:
-    """Read ``timestamp tx ty tz qx qy qz qw`` lines.
-
-    Separators are white space or commas. Rows with NaN, infinity or a zero quaternion
-    and rows that repeat the time before them are dropped; quaternions are normalised.
-
-    Returns:
-        The trajectory, and one line for each kind of repair with its count.
-
-    Raises:
-        DatasetError: the file is missing, a line is malformed or its time decreases (the
-            line is named), or no pose is left.
-    """
-    path = Path(path)
-    rows: list[list[float]] = []
-    invalid = repeated = 0
-    for number, line in read_lines(path):
-        row = _parse_tum_row(path, number, line)
-        if not all(map(math.isfinite, row)) or max(map(abs, row[4:])) < 1e-6:
-            invalid += 1
-        elif rows and row[0] == rows[-1][0]:
-            repeated += 1
-        elif rows and row[0] < rows[-1][0]:
-            raise DatasetError(
-                f"{path}:{number}: time {row[0]!r} comes after {rows[-1][0]!r}: sort the file by time"
-            )
-        else:
-            rows.append(row)
-    if not rows:
-        raise DatasetError(f"{path}: holds no valid pose ({invalid} rows with NaN or a zero quaternion)")
-
-    table = np.array(rows, dtype=np.float64)
-    quats_xyzw = table[:, 4:] / np.abs(table[:, 4:]).max(
-        axis=1, keepdims=True
-    )  # so that norms cannot overflow
-    lengths = np.linalg.norm(quats_xyzw, axis=1) * np.abs(table[:, 4:]).max(axis=1)
-    odd = int(np.count_nonzero(np.abs(lengths - 1.0) > 0.05))
-    T_world_camera = np.tile(np.eye(4), (len(table), 1, 1))
-    T_world_camera[:, :3, :3] = _rotations(quats_xyzw)
-    T_world_camera[:, :3, 3] = table[:, 1:4]
-
-    counted = {
-        "rows with NaN, infinity or a zero quaternion dropped": invalid,
-        "rows with the time of the row before dropped": repeated,
-        "quaternions whose length is not 1 normalised": odd,
-    }
-    notes = [f"{path.name}: {count} {what}" for what, count in counted.items() if count]
-    return Trajectory(table[:, 0].copy(), T_world_camera), notes
 
 
 def write_tum_trajectory(path: str | Path, trajectory: Trajectory) -> None:
@@ -180,22 +127,3 @@ def format_tum_row(timestamp_s: float, T_world_camera: NDArray[np.float64]) -> s
     quat_xyzw = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
     numbers = " ".join(f"{value:.10g}" for value in (*T[:3, 3].tolist(), *quat_xyzw.tolist()))
     return f"{format_timestamp(timestamp_s)} {numbers}\n"
-
-
-def _parse_tum_row(path: Path, number: int, line: str) -> list[float]:
-    fields = line.replace(",", " ").split()
-    try:
-        row = [parse_float(text) for text in fields]
-    except ValueError:
-        row = []
-    if len(row) != 8:
-        raise DatasetError(
-            f"{path}:{number}: expected eight numbers 'timestamp tx ty tz qx qy qz qw', found {line[:80]!r}"
-        )
-    return row
-
-
-def _rotations(quats_xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_quat(quats_xyzw).as_matrix())
