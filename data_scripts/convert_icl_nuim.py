@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 from tum_layout import SourceFrame, run_converter, write_sequence
 
-from slamdepth.datasets.sequence import check_size, first_image
+from slamdepth.datasets.orientation import check_size
+from slamdepth.datasets.sequence import first_image
 from slamdepth.errors import DatasetError
 from slamdepth.io import read_lines, read_tum_trajectory
 from slamdepth.types import Camera, Trajectory

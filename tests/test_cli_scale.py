@@ -146,7 +146,10 @@ def test_a_number_and_a_known_baseline(tiny_room: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("scale", "COLOUR", "--depth", "flat"), "has no sensor depth to fit a scale to"),
+        (
+            ("scale", "COLOUR", "--depth", "flat"),
+            "has no sensor depth (no depth images), so no scale can be fitted",
+        ),
         (("scale", "ROOM", "--depth", "sensor"), "in metres already"),
         (("scale", "ROOM", "--depth", "relative"), "fit both (--shift)"),
         (("scale", "ROOM", "--depth", "relative", "--shift"), "the same value everywhere"),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -106,19 +107,23 @@ def test_what_is_no_video(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("times_ms", "expected_s", "notes"),
+    ("times_ms", "camera_fps", "expected_s", "note"),
     [
-        ([40.0, 73.0, 140.0], [0.0, 0.033, 0.1], 0),  # a phone's, at no equal intervals
-        ([0.0, 0.0, 0.0], [0.0, 0.1, 0.2], 1),
-        ([0.0, 50.0, 40.0], [0.0, 0.1, 0.2], 1),
+        ([40.0, 73.0, 140.0], None, [0.0, 0.033, 0.1], ""),  # a phone's, at no equal intervals
+        ([40.0, 73.0, 140.0], 20.0, [0.0, 0.033, 0.1], ""),
+        ([0.0, 0.0, 0.0], None, [0.0, 0.1, 0.2], "are all the same; 10 Hz (as the video names) is assumed"),
+        ([0.0, 50.0, 40.0], None, [0.0, 0.1, 0.2], "do not increase; 10 Hz (as the video names) is"),
+        ([0.0, 0.0, 0.0], 20.0, [0.0, 0.05, 0.1], "all the same; 20 Hz (fps of the camera file) is assumed"),
+        ([0.0, 50.0, 40.0], 20.0, [0.0, 0.05, 0.1], "not increase; 20 Hz (fps of the camera file) is"),
     ],
 )
 def test_each_frame_says_its_own_time(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     times_ms: list[float],
+    camera_fps: float | None,
     expected_s: list[float],
-    notes: int,
+    note: str,
 ) -> None:
     class Capture:
         def __init__(self) -> None:
@@ -137,5 +142,77 @@ def test_each_frame_says_its_own_time(
 
     video = VideoFile(grey_video(tmp_path / "walk.mp4"))
     monkeypatch.setattr(video, "_open", Capture)
-    np.testing.assert_allclose(video.timestamps_s(), expected_s)
-    assert len(video.notes) == notes
+    np.testing.assert_allclose(video.timestamps_s(camera_fps), expected_s)
+    assert [note in one for one in video.notes] == [True] * bool(note)
+
+
+def test_fps_of_the_camera_file_replaces_useless_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_camera(tmp_path / "phone.yaml", Camera(64, 48, 60.0, 60.0, 31.5, 23.5, fps=4.0))
+    video = grey_video(tmp_path / "walk.mp4")
+    monkeypatch.setattr(cv2, "CAP_PROP_POS_MSEC", cv2.CAP_PROP_ORIENTATION_META)  # is 0 for each frame
+    dataset = open_dataset(video, tmp_path / "phone.yaml")
+    np.testing.assert_allclose(dataset.timestamps_s, np.arange(COUNT) / 4)
+    assert dataset.camera.fps == 4.0
+    assert "4 Hz (fps of the camera file) is assumed" in dataset.notes[0]
+
+
+def noisy_video(path: Path, codec: str, count: int = 30) -> Path:
+    rng = np.random.default_rng(0)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 10.0, (64, 48))
+    for _ in range(count):
+        writer.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
+    writer.release()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("ending", "codec"), [("avi", "MJPG"), ("mkv", "MJPG"), ("mp4", "mp4v"), ("mov", "mp4v")]
+)
+def test_a_whole_video_promises_what_it_holds(tmp_path: Path, ending: str, codec: str) -> None:
+    video = noisy_video(tmp_path / f"walk.{ending}", codec)
+    dataset = open_dataset(video, camera_file(tmp_path / "phone.yaml"))
+    assert isinstance(dataset, VideoSequence)
+    assert (len(dataset), dataset.frames_promised, dataset.notes) == (30, 30, [])
+
+
+def damaged(data: bytes) -> bytes:
+    third, gap = len(data) // 3, len(data) // 4
+    return data[:third] + bytes(gap) + data[third + gap :]
+
+
+@pytest.mark.parametrize(
+    ("ending", "codec", "harm"),
+    [
+        ("avi", "MJPG", lambda data: data[: len(data) // 2]),
+        ("mkv", "MJPG", lambda data: data[: len(data) // 2]),
+        ("avi", "MJPG", damaged),
+        ("mkv", "MJPG", damaged),
+        ("mp4", "mp4v", damaged),
+    ],
+)
+def test_frames_that_are_missing_are_counted(
+    tmp_path: Path, ending: str, codec: str, harm: Callable[[bytes], bytes]
+) -> None:
+    video = noisy_video(tmp_path / f"walk.{ending}", codec)
+    video.write_bytes(harm(video.read_bytes()))
+    dataset = open_dataset(video, camera_file(tmp_path / "phone.yaml"))
+    assert isinstance(dataset, VideoSequence)
+    assert dataset.frames_promised == 30
+    assert 0 < len(dataset) < 29
+    missing = 30 - len(dataset)
+    assert dataset.notes == [
+        f"the video promises 30 frames, {len(dataset)} can be read: {missing} are missing; it was cut short "
+        "or is damaged"
+    ]
+
+
+def test_an_estimated_number_of_frames_is_no_promise(tmp_path: Path) -> None:
+    video = VideoFile(grey_video(tmp_path / "walk.mp4"))
+    video.path, video.frames_named = tmp_path / "walk.webm", 100
+    assert "88 are missing" in video.missing_note(12, np.arange(12) / 10)
+    assert video.missing_note(12, np.arange(12) / 3) == ""  # of a phone that slowed down in the dark
+    assert video.missing_note(12) == ""
+    video.frames_named = 13
+    assert video.missing_note(12, np.arange(12) / 10) == ""

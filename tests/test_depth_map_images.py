@@ -138,8 +138,8 @@ def test_exif_gives_a_nominal_focal_length(tmp_path: Path) -> None:
     exif[0x0112] = 6  # taken with the camera on its side
     Image.new("RGB", (360, 240)).save(tmp_path / "a.jpg", exif=exif)
     assert exif_focal_35mm(tmp_path / "a.jpg") == 26.0
-    assert read_image_rgb(tmp_path / "a.jpg").shape == (240, 360, 3)
-    assert read_image_rgb(tmp_path / "a.jpg", upright=True).shape == (360, 240, 3)
+    assert read_image_rgb(tmp_path / "a.jpg").shape == (360, 240, 3)
+    assert read_image_rgb(tmp_path / "a.jpg", upright=False).shape == (240, 360, 3)
     found = intrinsics_of(360, 240, 26.0)
     assert found.camera.fx == pytest.approx(260.0)  # 36 mm are 360 pixels
     assert found.certainty is Certainty.NOMINAL

@@ -30,7 +30,8 @@ def keyframe(number: int, scale: float, *, is_sensor: bool = False) -> Keyframe:
 
 
 def test_predicted_depth_is_judged_as_the_model_gave_it() -> None:
-    score = score_depth(MadeUpDataset(5), tuple(keyframe(i, 1.25) for i in (0, 2, 4)))
+    score, notes = score_depth(MadeUpDataset(5), tuple(keyframe(i, 1.25) for i in (0, 2, 4)))
+    assert notes == ()
     assert score is not None
     assert score.frames == 3
     assert score.metric.abs_rel == pytest.approx(0.25, abs=1e-6)
@@ -39,11 +40,11 @@ def test_predicted_depth_is_judged_as_the_model_gave_it() -> None:
 
 
 def test_a_sensor_is_not_judged_against_itself() -> None:
-    assert score_depth(MadeUpDataset(1), (keyframe(0, 1.0, is_sensor=True),)) is None
+    assert score_depth(MadeUpDataset(1), (keyframe(0, 1.0, is_sensor=True),)) == (None, ())
 
 
 def test_keyframes_whose_depth_is_broken_are_left_out() -> None:
-    score = score_depth(MadeUpDataset(2, broken_depth=(0,)), (keyframe(0, 2.0), keyframe(1, 1.0)))
+    score, _ = score_depth(MadeUpDataset(2, broken_depth=(0,)), (keyframe(0, 2.0), keyframe(1, 1.0)))
     assert score is not None
     assert (score.frames, score.metric.abs_rel) == (1, 0.0)
 

@@ -179,6 +179,9 @@ def test_console_tables() -> None:
     assert "80 of 82 images; 2 could not be read" in text
     assert "70 (87.5 %); 85.4 % of all 82 images" in text
     assert "could not be read" not in rendered(run_table({**summary, "skipped_frames": 0}))
+    damaged = rendered(run_table({**summary, "readable_frames": 82, "promised_frames": 120}))
+    assert "2 could not be read; the video promises 120 and 82 can be read" in damaged
+    assert "promises" not in text
     assert "not scored" in rendered(run_table(build_summary(bare_data())))
     assert f"{score.sim3.rmse_m:.6f} m" in rendered(trajectory_table(score.to_dict()))
 

@@ -56,6 +56,7 @@ def scale_command(
     from rich.progress import Progress
 
     from slamdepth.datasets import open_dataset
+    from slamdepth.datasets.sensor_depth import lack_of_depth
     from slamdepth.depth.registry import create_depth_model
     from slamdepth.depth.scale import check_can_fit, fit_scale
     from slamdepth.depth.scale_file import write_scale
@@ -68,8 +69,8 @@ def scale_command(
     dataset = open_dataset(sequence, camera)
     if not dataset.has_depth:
         raise DatasetError(
-            f"{sequence}: has no sensor depth to fit a scale to; 'slamdepth run SEQ --depth-scale "
-            "groundtruth' can take a scale from a ground truth trajectory"
+            f"{sequence}: {lack_of_depth(dataset)}, so no scale can be fitted; 'slamdepth run SEQ "
+            "--depth-scale groundtruth' can take a scale from a ground truth trajectory"
         )
     if output is not None:
         output = writable_file(output, ".yaml")

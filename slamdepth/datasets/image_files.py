@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics, exif_focal_35mm, intrinsics_of
-from slamdepth.datasets.sequence import check_size
+from slamdepth.datasets.orientation import exif_orientation, fitted_camera
 from slamdepth.errors import DatasetError
 from slamdepth.io import read_image_rgb
 from slamdepth.types import Camera, Frame
@@ -57,22 +57,22 @@ def short_names(images: list[Path]) -> list[str]:
 
 
 def read_image_frame(path: Path, index: int, given: tuple[Camera, str] | None) -> tuple[Frame, Intrinsics]:
-    """Read an image file as a frame.
+    """Read an image file as an upright frame.
 
     Args:
         index: the frame's index, and its time in seconds.
-        given: the camera and where it comes from; None takes the focal length from EXIF or guesses it,
-            and turns the image upright as EXIF says.
+        given: the camera and where it comes from; None takes the focal length from EXIF or guesses it.
 
     Raises:
         ImageDecodeError: the image does not decode.
         CameraError: its size is not the given camera's.
     """
-    image_rgb = read_image_rgb(path, upright=given is None)
+    image_rgb = read_image_rgb(path)
     height, width = image_rgb.shape[:2]
     if given is not None:
         camera, origin = given
-        check_size(path, image_rgb.shape, camera)
+        if (height, width) != (camera.height, camera.width):
+            camera = fitted_camera(path, image_rgb.shape, camera, exif_orientation(path), [])
         found = Intrinsics(camera, origin, Certainty.GIVEN)
     else:
         found = intrinsics_of(width, height, exif_focal_35mm(path))

@@ -11,9 +11,11 @@ import numpy as np
 
 from slamdepth.datasets.association import associate
 from slamdepth.datasets.base import Dataset
-from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
+from slamdepth.datasets.orientation import UPRIGHT, check_size, turned_image
+from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import read_depth_m, read_image_rgb
 from slamdepth.types import Camera, Frame, Trajectory
+from slamdepth.typing import Floats32
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,6 +34,8 @@ class ImageSequence(Dataset):
         image_paths: ``N`` colour images.
         depth_paths: ``N`` depth images, None for frames without one.
         unknown_raw_depth: raw depth values that mean unknown, besides 0.
+        why_no_depth: why no frame has depth although there are depth images; empty elsewhere.
+        orientation: EXIF's, of the stored pixels of colour and depth; frames are upright.
     """
 
     name: str
@@ -43,6 +47,8 @@ class ImageSequence(Dataset):
     ground_truth: Trajectory | None = None
     notes: list[str] = field(default_factory=list)
     unknown_raw_depth: tuple[int, ...] = ()
+    why_no_depth: str = ""
+    orientation: int = UPRIGHT
     has_depth: bool = field(init=False)
 
     def __post_init__(self) -> None:
@@ -69,16 +75,17 @@ class ImageSequence(Dataset):
         depth_path = self.depth_paths[index]
         if with_depth and depth_path is not None:
             depth_m = read_depth_m(depth_path, self.camera.depth_factor, unknown_raw=self.unknown_raw_depth)
+            depth_m = self._upright(depth_m)
             check_size(depth_path, depth_m.shape, self.camera)
         return Frame(index, float(self.timestamps_s[index]), image_rgb, self.camera, depth_m)
 
-
-def check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
-    """Raise CameraError where an image of ``shape`` (H, W, ...) is not the camera's."""
-    if shape[:2] != (camera.height, camera.width):
-        raise CameraError(
-            f"{path}: the image is {shape[1]}x{shape[0]}, the camera says {camera.width}x{camera.height}"
-        )
+    def _upright(self, depth_m: Floats32) -> Floats32:
+        """Depth ``(H, W)``, which has no EXIF and belongs to the stored pixels, turned as its image is."""
+        if self.orientation == UPRIGHT:
+            return depth_m
+        turned = turned_image(depth_m, self.orientation)
+        is_upright = depth_m.shape == (self.camera.height, self.camera.width) != turned.shape
+        return depth_m if is_upright else turned
 
 
 def first_image(paths: tuple[Path, ...]) -> tuple[Path, tuple[int, ...]]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from slamdepth.datasets.orientation import OF_ROTATION_DEG, UPRIGHT
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.typing import Floats
 
@@ -19,6 +20,11 @@ if TYPE_CHECKING:
 
 VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 _FALLBACK_FPS = 30.0
+_COUNTED_ENDINGS = (".mp4", ".m4v", ".mov", ".avi")
+"""Containers that hold the number of frames itself."""
+_FEWEST_MISSING = 2
+"""One frame is often lost where a decoder starts or ends."""
+_CONSTANT_RATE = 0.1
 
 
 class VideoFile:
@@ -28,6 +34,7 @@ class VideoFile:
         path: the file.
         width, height: of a frame in pixels, turned upright as the file says.
         fps: frames per second; 30 where the file does not say, with a note.
+        orientation: of the stored pixels, as EXIF numbers it, by the file's rotation flag.
         frames_named: number of frames by the file's header, which may be wrong; 0 where it has none.
         notes: what was guessed, one line each.
 
@@ -52,19 +59,23 @@ class VideoFile:
             self.height, self.width = image.shape[:2]
             fps = float(capture.get(cv2.CAP_PROP_FPS))
             named = float(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            rotation_deg = round(float(capture.get(cv2.CAP_PROP_ORIENTATION_META))) % 360
         finally:
             capture.release()
-        if not 0.1 <= fps <= 1000.0:
+        self.orientation = OF_ROTATION_DEG.get(rotation_deg, UPRIGHT)
+        self.fps = fps if 0.1 <= fps <= 1000.0 else _FALLBACK_FPS
+        if self.fps != fps:
             self.notes.append(f"the video names no usable frame rate; {_FALLBACK_FPS:g} Hz is assumed")
-            fps = _FALLBACK_FPS
-        self.fps = fps
         self.frames_named = round(named) if 0 < named < 1e9 else 0
 
-    def timestamps_s(self) -> Floats:
+    def timestamps_s(self, camera_fps: float | None = None) -> Floats:
         """``(N,)`` times of all frames in seconds from the first; reads the whole video once.
 
         A phone's frames do not come at equal intervals, so the time of each is read. Where times do not
-        increase, they follow from :attr:`fps`, with a note.
+        increase, they are counted, with a note.
+
+        Args:
+            camera_fps: frame rate by the camera file; it becomes :attr:`fps` where times are counted.
         """
         import cv2
 
@@ -76,9 +87,31 @@ class VideoFile:
             capture.release()
         found: Floats = np.array(times_s)
         if len(found) > 1 and not (np.diff(found) > 0).all():
-            self.notes.append(f"the times of the video's frames do not increase; {self.fps:g} Hz is assumed")
+            by = "as the video names" if camera_fps is None else "fps of the camera file"
+            self.fps = self.fps if camera_fps is None else camera_fps
+            are = "are all the same" if (found == found[0]).all() else "do not increase"
+            self.notes.append(f"the times of the video's frames {are}; {self.fps:g} Hz ({by}) is assumed")
             return np.asarray(np.arange(len(found)) / self.fps)
         return np.asarray(found - found[0])
+
+    def missing_note(self, frames: int, times_s: Floats | None = None) -> str:
+        """A line on the frames that the header promises in addition to the ``frames`` that can be read; empty
+        where none are missing, or where the header's number is none or a mere estimate.
+
+        Args:
+            times_s: ``(N,)`` times in seconds, which tell whether an estimate holds.
+        """
+        missing = self.frames_named - frames
+        is_counted = self.path.suffix.lower() in _COUNTED_ENDINGS
+        if not is_counted and times_s is not None and len(times_s) > 1:
+            # Other containers hold a duration, of which FFmpeg makes a number of frames at a constant rate.
+            is_counted = abs(float(np.median(np.diff(times_s))) * self.fps - 1.0) < _CONSTANT_RATE
+        if missing < _FEWEST_MISSING or not is_counted:
+            return ""
+        return (
+            f"the video promises {self.frames_named} frames, {frames} can be read: {missing} are missing; it "
+            "was cut short or is damaged"
+        )
 
     def frames(self, stride: int = 1) -> Iterator[tuple[int, Callable[[], NDArray[np.uint8]]]]:
         """Every ``stride``-th frame: its number from 0, and a function that decodes it.

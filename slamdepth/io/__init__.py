@@ -6,6 +6,7 @@ from __future__ import annotations
 from slamdepth.io.camera import write_camera
 from slamdepth.io.hashing import sha256_of
 from slamdepth.io.images import (
+    read_depth_file,
     read_depth_m,
     read_depth_raw,
     read_image_rgb,
@@ -24,6 +25,7 @@ __all__ = [
     "encode_ply",
     "format_timestamp",
     "parse_float",
+    "read_depth_file",
     "read_depth_m",
     "read_depth_raw",
     "read_image_rgb",

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,19 +22,21 @@ MILLIMETRES_END_M = 65.535
 """The farthest depth a 16-bit image in millimetres can hold."""
 
 
-def read_image_rgb(path: str | Path, *, upright: bool = False) -> NDArray[np.uint8]:
+def read_image_rgb(path: str | Path, *, upright: bool = True) -> NDArray[np.uint8]:
     """Read a colour image as ``(H, W, 3)`` uint8 RGB.
 
-    Grey images get three equal channels; a rotation noted in EXIF is applied only where
-    ``upright``, since intrinsics belong to the pixels as they were taken.
+    Grey images get three equal channels.
+
+    Args:
+        upright: turn the image as its EXIF says; False leaves the pixels as they are stored.
 
     Raises:
         ImageDecodeError: the file is missing, empty, cut short or no image.
     """
     import cv2
 
-    as_taken = 0 if upright else cv2.IMREAD_IGNORE_ORIENTATION
-    image = _decode(Path(path), cv2.IMREAD_COLOR | as_taken)
+    as_stored = 0 if upright else cv2.IMREAD_IGNORE_ORIENTATION
+    image = _decode(Path(path), cv2.IMREAD_COLOR | as_stored)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
@@ -43,9 +46,7 @@ def read_depth_raw(path: str | Path) -> NDArray[np.uint16]:
     Raises:
         ImageDecodeError: the file is missing, empty, cut short, or no 16-bit image of one channel.
     """
-    import cv2
-
-    raw = _decode(Path(path), cv2.IMREAD_UNCHANGED)
+    raw = read_depth_file(path)
     if raw.ndim != 2 or raw.dtype != np.uint16:
         raise ImageDecodeError(
             f"{path}: a depth image has one channel of 16 bits, this is {raw.shape} {raw.dtype}"
@@ -53,21 +54,56 @@ def read_depth_raw(path: str | Path) -> NDArray[np.uint16]:
     return raw
 
 
+def read_depth_file(path: str | Path) -> NDArray[Any]:
+    """Read a depth image, or an array of NumPy (``.npy``), as it is stored.
+
+    Raises:
+        ImageDecodeError: the file is missing, empty, cut short, or does not decode.
+    """
+    import cv2
+
+    path = Path(path)
+    if path.suffix.lower() == ".npy":
+        return _load_npy(path)
+    if path.suffix.lower() == ".exr":  # OpenCV 4 reads this format only on request, version 5 not at all
+        os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
+        try:
+            return _decode(path, cv2.IMREAD_UNCHANGED)
+        except ImageDecodeError as error:
+            raise ImageDecodeError(
+                f"{error}; not every OpenCV reads EXR: write 32-bit TIFF or .npy"
+            ) from error
+    return _decode(path, cv2.IMREAD_UNCHANGED)
+
+
 def read_depth_m(path: str | Path, depth_factor: float, *, unknown_raw: Sequence[int] = ()) -> Floats32:
-    """Read a 16-bit depth image as ``(H, W)`` float32 metres, 0 where unknown.
+    """Read a depth image as ``(H, W)`` float32 metres, 0 where unknown.
 
     Args:
-        path: the image.
-        depth_factor: raw units per metre.
+        path: an image of one channel: integers of 16 bits or more in raw units, or floats in metres, whose
+            negative and not finite values are unknown; PNG, TIFF, EXR (where OpenCV reads it) or ``.npy``.
+        depth_factor: raw units per metre, for integers.
         unknown_raw: raw values that mean unknown, besides 0.
 
     Raises:
-        ImageDecodeError: as :func:`read_depth_raw`.
+        ImageDecodeError: the file is missing, empty, cut short, or no depth image.
     """
-    raw = read_depth_raw(path)
-    depth_m: Floats32 = raw.astype(np.float32) / np.float32(depth_factor)
+    raw = read_depth_file(path)
+    if raw.ndim != 2 or not (raw.dtype.kind == "f" or (raw.dtype.kind in "iu" and raw.dtype.itemsize >= 2)):
+        raise ImageDecodeError(
+            f"{path}: a depth image has one channel of 16 bits or of floats, this is {raw.shape} {raw.dtype}"
+        )
+    depth_m: Floats32
+    if raw.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            depth_m = raw.astype(np.float32)
+        depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0.0
+        return depth_m
+    depth_m = raw.astype(np.float32) / np.float32(depth_factor)
     for value in unknown_raw:
         depth_m[raw == value] = 0.0
+    if raw.dtype.kind == "i":
+        depth_m[raw < 0] = 0.0
     return depth_m
 
 
@@ -112,6 +148,15 @@ def write_npy(path: str | Path, array: NDArray[Any]) -> None:
     """
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.save(file, array, allow_pickle=False)
+
+
+def _load_npy(path: Path) -> NDArray[Any]:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ImageDecodeError(f"{path}: cannot be read: {reason}") from error
+    return np.squeeze(array) if array.ndim == 3 else np.asarray(array)
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from slamdepth.datasets import Dataset, open_dataset
+from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.errors import DatasetError
 from slamdepth.pipeline.training_data import SequencePlace, sequence_readers
 from slamdepth.training.data import Place, data_folder, known_readers, open_place
@@ -69,15 +70,19 @@ def _with_depth(datasets: list[Dataset]) -> list[Place]:
     """Those that have sensor depth; the others are left out with a warning.
 
     Raises:
-        DatasetError: none of them has any.
+        DatasetError: none of them has any, or depth images cannot be a sensor's.
     """
     with_depth = [dataset for dataset in datasets if dataset.has_depth]
     if not with_depth:
         return [SequencePlace.of(datasets[0])]  # raises, and names it
     for dataset in datasets:
         if not dataset.has_depth:
-            logger.warning("%s: left out, has no sensor depth", dataset.path)
-    return [SequencePlace.of(dataset) for dataset in with_depth]
+            logger.warning("%s: left out, %s", dataset.path, lack_of_depth(dataset))
+    places: list[SequencePlace] = [SequencePlace.of(dataset) for dataset in with_depth]
+    for place in places:
+        for note in check_sensor_depth(place.dataset, place.frames):
+            logger.warning("%s: %s", place.name, note)
+    return [*places]
 
 
 def _is_place(folder: Path) -> bool:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from slamdepth.config import GROUND_TRUTH, Config
 from slamdepth.datasets import Dataset
+from slamdepth.datasets.sensor_depth import check_sensor_depth
 from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.scale import DepthScale, ScaleDomain, ScaleFit, fit_scale, needs_shift
 from slamdepth.depth.scale_file import check_same_model, read_scale
@@ -183,8 +184,11 @@ def read_with_depth(
         progress: called with the frames read so far and in all.
 
     Raises:
+        DatasetError: the depth images cannot be a sensor's.
         RunInterrupted: ``stop`` was set.
     """
+    for note in check_sensor_depth(dataset, indices):
+        logger.warning("%s", note)
     for done, index in enumerate(indices):
         progress(done, len(indices))
         if stop is not None and stop.is_set():

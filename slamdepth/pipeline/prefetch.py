@@ -19,6 +19,8 @@ from slamdepth.types import Frame
 logger = logging.getLogger(__name__)
 
 _POLL_S = 0.1
+_WARNINGS = 5
+"""Depth images named one by one before they are only counted."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,10 @@ class FramePrefetcher:
         except ImageDecodeError as error:
             frame = self._dataset.read(index)  # raises again where it is the colour image
             self.broken_depth_images += 1
-            logger.warning("depth of frame %d left out: %s", index, error)
+            level = logging.WARNING if self.broken_depth_images <= _WARNINGS else logging.DEBUG
+            logger.log(level, "depth of frame %d left out: %s", index, error)
+            if self.broken_depth_images == _WARNINGS:
+                logger.warning("further depth images that do not decode are only counted")
         return frame
 
     def _put(self, item: ReadFrame | Exception | None) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset
+from slamdepth.datasets.sensor_depth import check_sensor_depth
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.evaluation import DepthScore, DepthScorer, TrajectoryScore, score_trajectory
 from slamdepth.mapping.keyframe import Keyframe
@@ -88,14 +89,25 @@ def judge_trajectory(
     return score, (note,)
 
 
-def score_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore | None:
-    """Compare the keyframes' predicted depth, as the tracker got it, with the sensor's."""
-    if not dataset.has_depth:
-        return None
+def score_depth(
+    dataset: Dataset, keyframes: tuple[Keyframe, ...]
+) -> tuple[DepthScore | None, tuple[str, ...]]:
+    """Compare the keyframes' predicted depth, as the tracker got it, with the sensor's; depth images that
+    cannot be a sensor's become a note."""
+    predicted = [
+        keyframe
+        for keyframe in keyframes
+        if not keyframe.prediction.is_sensor and keyframe.prediction.kind is DepthKind.METRIC
+    ]
+    if not dataset.has_depth or not predicted:
+        return None, ()
+    try:
+        notes = tuple(check_sensor_depth(dataset, [keyframe.frame.index for keyframe in predicted]))
+    except DatasetError as error:
+        logger.warning("predicted depth is not scored: %s", error)
+        return None, (f"predicted depth is not scored: {error}",)
     scorer = DepthScorer()
-    for keyframe in keyframes:
-        if keyframe.prediction.is_sensor or keyframe.prediction.kind is not DepthKind.METRIC:
-            continue
+    for keyframe in predicted:
         try:
             sensor_m = dataset.read(keyframe.frame.index, with_depth=True).depth_m
         except ImageDecodeError as error:
@@ -103,4 +115,4 @@ def score_depth(dataset: Dataset, keyframes: tuple[Keyframe, ...]) -> DepthScore
             continue
         if sensor_m is not None:
             scorer.add(keyframe.prediction.load().values, sensor_m)
-    return scorer.score()
+    return scorer.score(), notes

@@ -15,6 +15,7 @@ import numpy as np
 
 from slamdepth.config import Config, merge
 from slamdepth.datasets import Dataset, open_dataset
+from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.depth.scale_file import write_scale
@@ -153,11 +154,12 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     given = create_depth_model(
         config.depth.name, device=config.device, seed=config.seed, weights=config.depth.weights
     )
-    if is_sensor(given) and not dataset.has_depth:
-        raise DatasetError(
-            f"{dataset.path}: has no sensor depth (no depth images); run it with predicted depth: "
-            "--depth dinov2"
-        )
+    if is_sensor(given):
+        if not dataset.has_depth:
+            raise DatasetError(
+                f"{dataset.path}: {lack_of_depth(dataset)}; run it with predicted depth: --depth dinov2"
+            )
+        dataset.notes += check_sensor_depth(dataset, indices)
     scale = choose_prediction_scale(
         dataset,
         given,
@@ -220,6 +222,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     trajectory_score, score_notes = judge_trajectory(
         dataset, reconstruction.trajectory, is_measured=job.depth_is_measured
     )
+    depth_score, depth_notes = score_depth(dataset, reconstruction.keyframes)
     optional = (("mesh.ply", mesh), ("mesh.png", mesh_images), ("depth_scale.yaml", scale.fit))
     absent = {name for name, is_there in optional if not is_there}
     summary = write_report(
@@ -235,11 +238,13 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
             weights=(*job.model.weights, *feature_weights(config.features)),
             steps=tracked.steps,
             trajectory_score=trajectory_score,
-            depth_score=score_depth(dataset, reconstruction.keyframes),
+            depth_score=depth_score,
             mesh=mesh,
             mesh_images=mesh_images,
             skipped_frames=tracked.skipped,
-            notes=(*notes, *mesh_notes, *score_notes),
+            readable_frames=len(dataset),
+            promised_frames=getattr(dataset, "frames_promised", len(dataset)),
+            notes=(*notes, *mesh_notes, *score_notes, *depth_notes),
             options=_reported_options(job.options, tracked),
             files={name: what for name, what in FILES.items() if name not in absent},
         ),

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from slamdepth.datasets import Dataset, Reader, known_readers
+from slamdepth.datasets.sensor_depth import lack_of_depth
 from slamdepth.datasets.sequence import ImageSequence, is_file
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
 from slamdepth.synth.sequence import SETTINGS_FILE
@@ -52,7 +53,7 @@ class SequencePlace:
         else:
             frames = tuple(range(len(dataset))) if dataset.has_depth else ()
         if not frames:
-            raise DatasetError(f"{dataset.path}: has no sensor depth")
+            raise DatasetError(f"{dataset.path}: {lack_of_depth(dataset)}")
         return cls(dataset, frames, benchmark)
 
     def __len__(self) -> int:

@@ -46,11 +46,15 @@ def _frame_rows(summary: dict[str, Any]) -> Rows:
     """Frames and tracked frames; where images could not be read, also the share of all images."""
     frames, tracked, unread = summary["frames"], summary["tracked"], summary["skipped_frames"]
     placed = f"{count(tracked)} ({percent(summary['tracked_fraction'])})"
+    readable, all_promised = summary["readable_frames"], summary["promised_frames"]
+    promised = ""
+    if all_promised != readable:
+        promised = f"; the video promises {count(all_promised)} and {count(readable)} can be read"
     if not unread:
-        return [("frames", count(frames)), ("tracked", placed)]
+        return [("frames", f"{count(frames)}{promised}"), ("tracked", placed)]
     images = frames + unread
     return [
-        ("frames", f"{count(frames)} of {count(images)} images; {count(unread)} could not be read"),
+        ("frames", f"{count(frames)} of {count(images)} images; {count(unread)} could not be read{promised}"),
         ("tracked", f"{placed}; {percent(tracked / images)} of all {count(images)} images"),
     ]
 

@@ -38,6 +38,8 @@ class ReportData:
         trajectory_score, depth_score, mesh: None where there is none.
         mesh_images: views of the mesh; empty where there is none.
         skipped_frames: images that could not be read: damaged, or missing.
+        readable_frames, promised_frames: of the whole sequence, and as the header of a video says; None where
+            that is not known.
         notes: what was guessed, dropped or repaired, one line each.
         options: what was asked for in addition to the settings.
         files: what each file of the run folder holds, by file name.
@@ -57,6 +59,8 @@ class ReportData:
     mesh: MeshCounts | None = None
     mesh_images: tuple[MeshImage, ...] = ()
     skipped_frames: int = 0
+    readable_frames: int | None = None
+    promised_frames: int | None = None
     notes: tuple[str, ...] = ()
     options: dict[str, object] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)

@@ -25,6 +25,8 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         "tracked": statistics.tracked,
         "tracked_fraction": statistics.tracked / statistics.frames if statistics.frames else None,
         "skipped_frames": data.skipped_frames,
+        "readable_frames": data.readable_frames,
+        "promised_frames": data.promised_frames,
         "keyframes": len(run.keyframes),
         "loop_closures": statistics.loop_closures,
         "relocalisations": statistics.relocalisations,

@@ -10,11 +10,12 @@ import numpy as np
 
 from slamdepth.calibration import CAMERA_FILE, what_to_write
 from slamdepth.datasets.image_files import has_images, list_images
+from slamdepth.datasets.orientation import check_size, exif_orientation, fitted_camera
 from slamdepth.datasets.registry import register_last_reader
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
-from slamdepth.datasets.sequence import ImageSequence, check_size, first_image
+from slamdepth.datasets.sequence import ImageSequence, first_image
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
-from slamdepth.io import read_depth_raw, read_image_rgb
+from slamdepth.io import read_depth_file, read_image_rgb
 from slamdepth.types import Camera, Frame
 
 if TYPE_CHECKING:
@@ -48,7 +49,8 @@ class ImagesReader:
                 f"{path}: the intrinsics of these images are unknown: write {camera_path} or pass --camera "
                 f"FILE with {what_to_write(sample_shape[1], sample_shape[0])}"
             )
-        check_size(sample_path, sample_shape, camera)
+        orientation = exif_orientation(sample_path, notes)
+        camera = fitted_camera(sample_path, sample_shape, camera, orientation, notes)
         return FolderSequence(path, camera, images, notes)
 
 
@@ -56,7 +58,7 @@ class FolderSequence(ImageSequence):
     """The :class:`~slamdepth.datasets.base.Dataset` of a folder of images; large ones are reduced.
 
     Args:
-        taken_by: the camera of the images as they are on disk; its ``fps`` gives the times.
+        taken_by: the camera of the upright images in their own size; its ``fps`` gives the times.
         notes: takes a line for each assumption.
     """
 
@@ -102,9 +104,11 @@ def _check_names(path: Path, images: tuple[Path, ...]) -> None:
 
 def _check_no_depth(path: Path) -> None:
     try:
-        read_depth_raw(path)
+        image = read_depth_file(path)
     except ImageDecodeError:
         return
-    raise DatasetError(
-        f"{path}: has 16 bits of grey, as depth images have; a sequence is of images of 8 bits"
-    )
+    if image.ndim == 2 and image.dtype.itemsize > 1:
+        raise DatasetError(
+            f"{path}: has {8 * image.dtype.itemsize} bits of grey, as depth images have; a sequence is of "
+            "images of 8 bits"
+        )

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.calibration import CAMERA_FILE
+from slamdepth.datasets.orientation import exif_orientation, fitted_camera
 from slamdepth.datasets.registry import register_reader
-from slamdepth.datasets.sequence import ImageSequence, check_size, first_image
+from slamdepth.datasets.sequence import ImageSequence, first_image
 from slamdepth.errors import DatasetError
 from slamdepth.geometry import orthonormalised
 from slamdepth.io import parse_float, read_lines
@@ -56,7 +57,8 @@ class SevenScenesReader:
         image_paths = tuple(frames.values())
         sample_path, sample_shape = first_image(image_paths)
         camera = _find_camera(path, camera, notes)
-        check_size(sample_path, sample_shape, camera)
+        orientation = exif_orientation(sample_path, notes)
+        camera = fitted_camera(sample_path, sample_shape, camera, orientation, notes)
 
         timestamps_s = np.array(list(frames), dtype=np.float64) / FRAME_RATE_HZ
         depth_paths = tuple(_sibling(image, ".depth.png") for image in image_paths)
@@ -73,6 +75,7 @@ class SevenScenesReader:
             _read_poses(image_paths, timestamps_s, notes),
             notes,
             UNKNOWN_RAW_DEPTH,
+            orientation=orientation,
         )
 
 

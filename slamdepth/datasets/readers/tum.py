@@ -2,35 +2,37 @@
 """The layout of the TUM RGB-D benchmark (Sturm et al., IROS 2012).
 
 ``rgb.txt`` and, optionally, ``depth.txt`` list ``timestamp filename``; ``groundtruth.txt``
-lists camera-to-world poses. Depth images are 16-bit PNGs registered to the colour image.
+lists camera-to-world poses. Depth images are registered to the colour image: 16 bits, or floats in metres.
+Times are in seconds; other units are recognised and converted.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slamdepth.calibration import CAMERA_FILE, what_to_write
 from slamdepth.datasets.association import associate
 from slamdepth.datasets.image_files import has_images
+from slamdepth.datasets.orientation import exif_orientation, fitted_camera
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import (
     MAX_TIME_DIFFERENCE_S,
     ImageSequence,
     check_overlap,
-    check_size,
     first_image,
     is_file,
 )
 from slamdepth.errors import CameraError, DatasetError
-from slamdepth.io import parse_float, read_lines, read_tum_trajectory
+from slamdepth.io import parse_float, read_tum_trajectory
+from slamdepth.io.columns import stated_unit
+from slamdepth.io.text import read_commented_lines
+from slamdepth.io.times import TimeColumn, conversion_notes, judge_unit, settle_unit
+from slamdepth.io.trajectory_reader import unit_of
 from slamdepth.types import Camera
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from slamdepth.typing import Floats
 
 # As ORB-SLAM2's settings files give them, but for the depth factor of freiburg2 (see the note).
 _KNOWN_CAMERAS = {
@@ -67,29 +69,40 @@ class TumReader:
                 f"{path / 'rgb'}, as a command in the README does; or name that folder itself, if they were "
                 "taken at equal intervals"
             )
-        timestamps_s, image_paths = read_image_list(path / "rgb.txt")
+        times, image_paths = read_image_list(path / "rgb.txt")
         _check_images(path / "rgb.txt", image_paths, notes)
         sample_path, sample_shape = first_image(image_paths)
         if camera is None:
             camera = _find_camera(path, sample_shape, notes)
-        check_size(sample_path, sample_shape, camera)
+        orientation = exif_orientation(sample_path, notes)
+        camera = fitted_camera(sample_path, sample_shape, camera, orientation, notes)
+        timestamps_s = _seconds(path / "rgb.txt", times, camera.fps, None, notes)
 
-        depth_paths = _match_depth(path / "depth.txt", timestamps_s, notes)
+        depth_paths, why_no_depth = _match_depth(path / "depth.txt", timestamps_s, camera.fps, notes)
         ground_truth = None
         if (path / "groundtruth.txt").exists():
-            ground_truth, repairs = read_tum_trajectory(path / "groundtruth.txt")
+            ground_truth, repairs = read_tum_trajectory(path / "groundtruth.txt", timestamps_s)
             notes += repairs
             check_overlap(timestamps_s, ground_truth, path / "groundtruth.txt")
         return ImageSequence(
-            path.resolve().name, path, camera, timestamps_s, image_paths, depth_paths, ground_truth, notes
+            path.resolve().name,
+            path,
+            camera,
+            timestamps_s,
+            image_paths,
+            depth_paths,
+            ground_truth,
+            notes,
+            why_no_depth=why_no_depth,
+            orientation=orientation,
         )
 
 
-def read_image_list(path: Path) -> tuple[NDArray[np.float64], tuple[Path, ...]]:
+def read_image_list(path: Path) -> tuple[TimeColumn, tuple[Path, ...]]:
     """Read ``timestamp filename`` lines; file names are relative to the list.
 
     Returns:
-        Times ``(N,)`` in seconds, strictly increasing, and ``N`` paths.
+        ``N`` times, strictly increasing, in the unit of the file, and ``N`` paths.
 
     Raises:
         DatasetError: the file is missing, a line is malformed, or its time does not
@@ -98,9 +111,15 @@ def read_image_list(path: Path) -> tuple[NDArray[np.float64], tuple[Path, ...]]:
     if not path.exists():
         raise DatasetError(f"{path}: missing; it lists the images, 'timestamp filename' a line")
     times: list[float] = []
+    texts: list[str] = []
     images: list[Path] = []
-    for number, line in read_lines(path):
+    comments: list[str] = []
+    for number, line in read_commented_lines(path):
         fields = re.split(r"[\s,]+", line, maxsplit=1)
+        is_header = not times and re.match(r"%?time", fields[0], re.IGNORECASE) is not None
+        if line.startswith("#") or is_header:
+            comments += [line] if not times else []
+            continue
         try:
             time_s = parse_float(fields[0])
         except ValueError:
@@ -112,14 +131,24 @@ def read_image_list(path: Path) -> tuple[NDArray[np.float64], tuple[Path, ...]]:
                 f"{path}:{number}: time {fields[0]} does not come after {times[-1]:.6f}: times must increase"
             )
         times.append(time_s)
+        texts.append(fields[0])
         images.append(path.parent / fields[1])
-    return np.array(times, dtype=np.float64), tuple(images)
+    return TimeColumn(tuple(texts), stated_unit(comments)), tuple(images)
 
 
 def known_camera(name: str) -> Camera | None:
     """The camera of a TUM sequence by its folder's name, such as ``rgbd_dataset_freiburg1_desk``."""
     found = _KNOWN_NAME.search(name)
     return _KNOWN_CAMERAS[found[1]] if found else None
+
+
+def _seconds(
+    path: Path, times: TimeColumn, fps: float, reference_s: Floats | None, notes: list[str]
+) -> Floats:
+    """The times ``(N,)`` of a list in seconds; a conversion is noted."""
+    verdict = settle_unit(times, judge_unit(times, of_images=True, fps=fps), reference_s)
+    notes += conversion_notes(path.name, times, verdict)
+    return times.seconds(unit_of(path, times, verdict))
 
 
 def _check_images(list_path: Path, image_paths: tuple[Path, ...], notes: list[str]) -> None:
@@ -135,23 +164,36 @@ def _check_images(list_path: Path, image_paths: tuple[Path, ...], notes: list[st
 
 
 def _match_depth(
-    list_path: Path, timestamps_s: NDArray[np.float64], notes: list[str]
-) -> tuple[Path | None, ...]:
+    list_path: Path, timestamps_s: Floats, fps: float, notes: list[str]
+) -> tuple[tuple[Path | None, ...], str]:
+    """The depth image of each colour image, and why there is none at all where some are listed."""
     matched: list[Path | None] = [None] * len(timestamps_s)
     if not list_path.exists():
-        return tuple(matched)
-    depth_times_s, depth_paths = read_image_list(list_path)
+        return tuple(matched), ""
+    times, depth_paths = read_image_list(list_path)
     _check_images(list_path, depth_paths, notes)
+    depth_times_s = _seconds(list_path, times, fps, timestamps_s, notes)
     for i, j in associate(timestamps_s, depth_times_s, MAX_TIME_DIFFERENCE_S):
         if is_file(depth_paths[j]):
             matched[i] = depth_paths[j]
     without = matched.count(None)
+    if without == len(matched):
+        why = (
+            f"{list_path.name}: {len(depth_paths)} depth images, none within {MAX_TIME_DIFFERENCE_S} s of a "
+            f"colour image: colour from {_range(timestamps_s)}, depth from {_range(depth_times_s)}"
+        )
+        notes.append(why)
+        return tuple(matched), why
     if without:
         notes.append(
             f"{list_path.name}: {without} of {len(matched)} colour images have no depth image "
             f"within {MAX_TIME_DIFFERENCE_S} s"
         )
-    return tuple(matched)
+    return tuple(matched), ""
+
+
+def _range(times_s: Floats) -> str:
+    return f"{times_s[0]:.3f} to {times_s[-1]:.3f} s"
 
 
 def _find_camera(path: Path, image_shape: tuple[int, ...], notes: list[str]) -> Camera:

@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from slamdepth.calibration import what_to_write
 from slamdepth.datasets.base import Dataset
+from slamdepth.datasets.orientation import fitted_camera
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
-from slamdepth.datasets.sequence import check_size
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
 from slamdepth.errors import CameraError, ImageDecodeError
 from slamdepth.types import Camera, Frame, Trajectory
@@ -20,6 +21,9 @@ from slamdepth.types import Camera, Frame, Trajectory
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+DEFAULT_FPS = 30.0
+"""``fps`` of a camera whose file says none."""
 
 
 @register_reader
@@ -40,8 +44,10 @@ class VideoReader:
                 f"{path}: the intrinsics of a video are unknown: pass --camera FILE, a camera.yaml with "
                 f"{what_to_write(video.width, video.height)}"
             )
-        check_size(path, (video.height, video.width), camera)
-        return VideoSequence(video, camera)
+        notes: list[str] = []
+        size = (video.height, video.width)
+        camera = fitted_camera(path, size, camera, video.orientation, notes)
+        return VideoSequence(video, camera, notes)
 
 
 class VideoSequence(Dataset):
@@ -50,17 +56,27 @@ class VideoSequence(Dataset):
     Frames are decoded in order, so reading forwards is fast; a step back starts from the first frame again.
     Several threads may read, one at a time.
 
+    Attributes:
+        frames_promised: number of frames by the video's header; more than ``len(self)`` where it was cut
+            short or is damaged.
+
     Args:
-        camera: for images of the video's own size.
+        camera: for upright images of the video's own size.
+        notes: what is known of both already.
     """
 
     has_depth = False
     ground_truth: Trajectory | None = None
 
-    def __init__(self, video: VideoFile, camera: Camera) -> None:
+    def __init__(self, video: VideoFile, camera: Camera, notes: Sequence[str] = ()) -> None:
         self.name, self.path = video.path.stem, video.path
-        self.timestamps_s = video.timestamps_s()
-        self.notes = list(video.notes)
+        # A camera file without fps has the default, which says less than the video.
+        camera_fps = camera.fps if camera.fps != DEFAULT_FPS else None
+        self.timestamps_s = video.timestamps_s(camera_fps)
+        self.notes = [*notes, *video.notes]
+        missing = video.missing_note(len(self), self.timestamps_s)
+        self.frames_promised = video.frames_named if missing else len(self)
+        self.notes += [missing] if missing else []
         self.camera = replace(reduced_camera(camera, self.notes), fps=video.fps)
         self._video = video
         self._lock = threading.Lock()

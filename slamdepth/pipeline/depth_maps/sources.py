@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 from slamdepth.datasets import Dataset, known_readers, open_dataset
 from slamdepth.datasets.image_files import IMAGE_ENDINGS, list_images, read_image_frame, short_names
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics, find_camera_file, intrinsics_of
-from slamdepth.datasets.sequence import check_size
+from slamdepth.datasets.orientation import fitted_camera
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.pipeline.sequence_id import sequence_id
@@ -159,18 +159,23 @@ class _VideoSource:
         if given is None:
             self._intrinsics = intrinsics_of(video.width, video.height)
         else:
-            check_size(video.path, (video.height, video.width), given[0])
-            self._intrinsics = Intrinsics(*given, Certainty.GIVEN)
+            size = (video.height, video.width)
+            self.camera = fitted_camera(video.path, size, given[0], video.orientation, [])
+            self._intrinsics = Intrinsics(self.camera, given[1], Certainty.GIVEN)
 
     def __len__(self) -> int:
         named: int = -(-self._video.frames_named // self._stride)
         return named if self._max_frames is None else min(named or self._max_frames, self._max_frames)
 
     def shots(self, *, with_depth: bool = False) -> Iterator[Shot]:
+        index = -1
         for count, (index, decode) in enumerate(self._video.frames(self._stride)):
             if count == self._max_frames:
                 return
             yield _numbered(index, partial(self._read, index, decode))
+        note = self._video.missing_note(index + 1) if self._stride == 1 else ""
+        if note and note not in self.notes:
+            self.notes.append(note)
 
     def _read(self, index: int, decode: Callable[[], NDArray[np.uint8]]) -> tuple[Frame, Intrinsics]:
         frame = Frame(index, index / self._video.fps, decode(), self._intrinsics.camera)

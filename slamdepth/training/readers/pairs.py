@@ -70,7 +70,8 @@ class PairPlace:
     def read(self, index: int) -> Frame:
         """Image and depth of pair ``index``; see :meth:`slamdepth.training.data.Place.read`."""
         try:
-            image_rgb, raw = read_image_rgb(self.images[index]), read_depth_raw(self.depths[index])
+            image_rgb = read_image_rgb(self.images[index], upright=False)  # as depth is stored
+            raw = read_depth_raw(self.depths[index])
         except ImageDecodeError as error:
             raise DatasetError(str(error)) from error
         expected = (self.camera.height, self.camera.width)
