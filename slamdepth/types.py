@@ -290,6 +290,7 @@ class RunStatistics:
         tracked: frames that have a pose.
         loop_closures, relocalisations, registrations: how often a loop was closed, and how many frames were
             placed by relocalisation and by point-cloud registration.
+        loops_refused: verified loops that were not closed, because they contradict the path.
         timings_ms: mean wall time in milliseconds per call of each stage.
         timing_calls: number of calls of each stage.
         readout_s: readout time of the rolling shutter in seconds, first image row to last; 0 for a global
@@ -309,3 +310,4 @@ class RunStatistics:
     readout_s: float | None = None
     readout_sigma_s: float | None = None
     scale_votes: tuple[float, ...] = ()
+    loops_refused: int = 0

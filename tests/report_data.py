@@ -7,7 +7,7 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.depth.alignment import as_given
-from slamdepth.evaluation import DepthScorer, score_trajectory
+from slamdepth.evaluation import DepthScorer, Health, RunFacts, judge_run, score_trajectory
 from slamdepth.geometry import se3_exp
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
@@ -70,6 +70,10 @@ def keyframe(number: int, *, is_sensor: bool = False) -> Keyframe:
     return Keyframe(number, frame, pose, np.zeros((1, 2)), 1.0 + 0.1 * number, prediction, as_given)
 
 
+def health_of(run: Reconstruction, steps: tuple[StepResult, ...] = ()) -> Health:
+    return judge_run(RunFacts(steps, run.trajectory, run.points_m, run.statistics, depth_is_measured=False))
+
+
 def full_data() -> ReportData:
     truth, estimate = trajectory(), trajectory(noise=0.01)
     kept = np.r_[0:30, 40:COUNT]
@@ -86,27 +90,29 @@ def full_data() -> ReportData:
         StepResult(i, 100.0 + i / 30, state, None, inliers=i, is_keyframe=i % 10 == 0)
         for i, state in enumerate(states)
     )
+    run = Reconstruction(
+        trajectory=estimate,
+        keyframes=keyframes,
+        points_m=np.random.default_rng(0).normal(size=(500, 3)),
+        notes=("the tracker's <note>",),
+        statistics=RunStatistics(
+            frames=COUNT,
+            tracked=70,
+            loop_closures=1,
+            relocalisations=1,
+            timings_ms={"features": 7.5, "depth": 180.0},
+            timing_calls={"features": 80, "depth": 6},
+        ),
+    )
     return ReportData(
         sequence="room <1>",
         depth_model="dinov2",
         depth_is_measured=False,
-        reconstruction=Reconstruction(
-            trajectory=estimate,
-            keyframes=keyframes,
-            points_m=np.random.default_rng(0).normal(size=(500, 3)),
-            notes=("the tracker's <note>",),
-            statistics=RunStatistics(
-                frames=COUNT,
-                tracked=70,
-                loop_closures=1,
-                relocalisations=1,
-                timings_ms={"features": 7.5, "depth": 180.0},
-                timing_calls={"features": 80, "depth": 6},
-            ),
-        ),
+        reconstruction=run,
         fps=12.5,
         config=Config(),
         scale=SCALE,
+        health=health_of(run, steps),
         weights=(WeightsInfo("head & backbone", "ab" * 32, "some rooms", "Apache-2.0"),),
         steps=steps,
         trajectory_score=score_trajectory(truth, estimate),
@@ -124,5 +130,12 @@ def bare_data() -> ReportData:
     nothing = Trajectory(np.empty(0), np.empty((0, 4, 4)))
     run = Reconstruction(nothing, (), np.empty((0, 3)))
     return ReportData(
-        "empty", "sensor", True, run, 0.0, Config(), ScaleFacts(ScaleSource.SENSOR, 1.0, "The sensor's.")
+        "empty",
+        "sensor",
+        True,
+        run,
+        0.0,
+        Config(),
+        ScaleFacts(ScaleSource.SENSOR, 1.0, "The sensor's."),
+        health_of(run),
     )

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scores: trajectories against a ground truth, depth maps against a sensor."""
+"""Scores: trajectories against a ground truth, depth maps against a sensor, runs without either."""
 
 from __future__ import annotations
 
 from slamdepth.evaluation.bootstrap import Interval
 from slamdepth.evaluation.depth import DepthErrors, DepthScore, DepthScorer
 from slamdepth.evaluation.depth_judge import DepthJudge, DepthJudgement, mean_over_sets
+from slamdepth.evaluation.health import Health, judge_run
+from slamdepth.evaluation.health_facts import HealthNumbers, RunFacts
+from slamdepth.evaluation.health_rules import Verdict
+from slamdepth.evaluation.health_spans import HealthSpan, SpanKind
 from slamdepth.evaluation.trajectory import (
     MAX_DIFFERENCE_S,
     AbsoluteError,
@@ -22,9 +26,16 @@ __all__ = [
     "DepthJudgement",
     "DepthScore",
     "DepthScorer",
+    "Health",
+    "HealthNumbers",
+    "HealthSpan",
     "Interval",
     "RelativeError",
+    "RunFacts",
+    "SpanKind",
     "TrajectoryScore",
+    "Verdict",
+    "judge_run",
     "mean_over_sets",
     "score_trajectory",
 ]

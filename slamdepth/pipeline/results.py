@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,20 @@ from slamdepth.config import Config
 from slamdepth.datasets import Dataset
 from slamdepth.datasets.sensor_depth import check_sensor_depth
 from slamdepth.errors import DatasetError, ImageDecodeError
-from slamdepth.evaluation import DepthScore, DepthScorer, TrajectoryScore, score_trajectory
+from slamdepth.evaluation import (
+    DepthScore,
+    DepthScorer,
+    Health,
+    RunFacts,
+    TrajectoryScore,
+    judge_run,
+    score_trajectory,
+)
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
 from slamdepth.report import MeshCounts, MeshImage, render_mesh_images
-from slamdepth.types import DepthKind, Trajectory
+from slamdepth.types import DepthKind, StepResult, Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -87,6 +96,29 @@ def judge_trajectory(
     )
     logger.warning("%s", note)
     return score, (note,)
+
+
+def judge_health(
+    reconstruction: Reconstruction, steps: Sequence[StepResult], config: Config, *, is_measured: bool
+) -> Health:
+    """Whether the result can be trusted, by what the run knows of itself.
+
+    Args:
+        steps: one for each frame, in order.
+        is_measured: a sensor measured the depth.
+    """
+    health = judge_run(
+        RunFacts(
+            steps,
+            reconstruction.trajectory,
+            reconstruction.points_m,
+            reconstruction.statistics,
+            is_measured,
+            config.tracking.min_inliers,
+        )
+    )
+    logger.info("verdict: %s. %s", health.verdict.value, health.headline)
+    return health
 
 
 def score_depth(

@@ -37,6 +37,7 @@ from slamdepth.pipeline.prediction_scale import (
     choose_prediction_scale,
 )
 from slamdepth.pipeline.results import (
+    judge_health,
     judge_trajectory,
     keyframe_trajectory,
     score_depth,
@@ -235,6 +236,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
             fps=tracked.fps,
             config=config,
             scale=scale_facts,
+            health=judge_health(reconstruction, tracked.steps, config, is_measured=job.depth_is_measured),
             weights=(*job.model.weights, *feature_weights(config.features)),
             steps=tracked.steps,
             trajectory_score=trajectory_score,

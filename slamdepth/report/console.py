@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from slamdepth.evaluation import Verdict
 from slamdepth.report.text import MISSING, count, fixed, percent
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ def run_table(summary: dict[str, Any]) -> Table:
         summary: of :func:`slamdepth.report.build_summary`.
     """
     rows = [
+        *_health_rows(summary["health"]),
         *_frame_rows(summary),
         ("frames per second", fixed(summary["fps"], 1)),
         ("keyframes", count(summary["keyframes"])),
@@ -40,6 +42,12 @@ def run_table(summary: dict[str, Any]) -> Table:
         rows.append(("mesh", f"{count(mesh['vertices'])} vertices, {count(mesh['triangles'])} triangles"))
     features = f" · features: {summary['features']}" if summary["features"] else ""
     return two_columns(f"{summary['sequence']} · depth: {summary['depth_model']}{features}", rows)
+
+
+def _health_rows(health: dict[str, Any]) -> Rows:
+    """The verdict in one line; where it is not good, the reasons too."""
+    reasons = [] if health["verdict"] == Verdict.GOOD.value else health["reasons"]
+    return [("verdict", health["headline"]), *(("", reason) for reason in reasons)]
 
 
 def _frame_rows(summary: dict[str, Any]) -> Rows:

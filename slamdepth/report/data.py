@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from slamdepth.config import Config
-from slamdepth.evaluation import DepthScore, TrajectoryScore
+from slamdepth.evaluation import DepthScore, Health, TrajectoryScore
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report.mesh_images import MeshImage
 from slamdepth.report.scale import ScaleFacts
@@ -33,6 +33,7 @@ class ReportData:
         fps: frames over the wall time of tracking, without meshing.
         config: every setting of the run.
         scale: is the map metric, and how was its scale found.
+        health: can the result be trusted, where not, and why.
         weights: every weights file that took part, and the data each has seen.
         steps: one result for each frame, in order; empty where they were not kept.
         trajectory_score, depth_score, mesh: None where there is none.
@@ -52,6 +53,7 @@ class ReportData:
     fps: float
     config: Config
     scale: ScaleFacts
+    health: Health
     weights: tuple[WeightsInfo, ...] = ()
     steps: tuple[StepResult, ...] = ()
     trajectory_score: TrajectoryScore | None = None

@@ -29,6 +29,7 @@ def build_html(data: ReportData, summary: dict[str, Any]) -> str:
         summary=summary,
         charts=_charts(data, summary),
         notes=_notes(summary),
+        span_rows=_span_rows(summary["health"]),
         axes=about_views(run.gravity_w),
         absolute_rows=_absolute_rows(summary["ate"]),
         relative_rows=_relative_rows(summary["rpe"]),
@@ -71,6 +72,14 @@ def _notes(summary: dict[str, Any]) -> list[str]:
     skipped = summary["skipped_frames"]
     unread = [f"{count(skipped)} images could not be read and were skipped"] if skipped else []
     return [*unread, *summary["notes"]]
+
+
+def _span_rows(health: dict[str, Any]) -> list[list[str]]:
+    """Kind, seconds since the first frame and evidence of each stretch that is worth a look."""
+    return [
+        [span["kind"], f"{fixed(span['from_s'], 2)} to {fixed(span['to_s'], 2, 's')}", span["why"]]
+        for span in health["spans"]
+    ]
 
 
 def _absolute_rows(ate: dict[str, Any]) -> list[list[str]]:

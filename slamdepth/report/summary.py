@@ -17,6 +17,7 @@ def build_summary(data: ReportData) -> dict[str, Any]:
     run, statistics = data.reconstruction, data.reconstruction.statistics
     return {
         "sequence": data.sequence,
+        "health": data.health.to_dict(),
         "depth_model": data.depth_model,
         "depth_is_measured": data.depth_is_measured,
         "features": data.config.features.name if data.config.odometry == "orb" else None,

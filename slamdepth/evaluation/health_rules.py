@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rules of a verdict.
+
+Each rule states what it rests on and what innocent cause looks the same. Thresholds are the same for all
+recordings, and relative: to the run's own median speed, to the fewest inliers the tracker accepts, to the
+length of the recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from slamdepth.evaluation.health_facts import HealthNumbers, RunFacts
+from slamdepth.evaluation.health_spans import LONG_S, HealthSpan, SpanKind
+from slamdepth.evaluation.leaps import MAX_STEP_S
+
+WEAK = 2
+"""Times the least inliers that the tracker accepts: one group of wrong matches less, and it would be lost."""
+
+_MUCH_LOST = 0.2  # of all frames
+_SOME_LOST = 0.05
+_LONG_START = 0.1
+_MANY_LEAPS = 3  # two are one wrong pose, there and back
+_MOSTLY = 0.5
+_MUCH_REGISTERED = 0.25
+_FRAMES_PER_KEYFRAME = 2.0
+_FEW_FRAMES = 20
+_FEW_REFUSED = 3
+_SCALE_SPREAD_LOG = 0.4  # a factor of 1.5; networks err by about 0.2 from image to image
+_SHOWN = 3  # spans named in one sentence
+
+
+class Verdict(str, Enum):
+    """What a run says of its own result."""
+
+    GOOD = "good"
+    DOUBTFUL = "doubtful"
+    NOT_TRUSTWORTHY = "not trustworthy"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one rule says: how grave it is, in a few words, and as a sentence."""
+
+    level: Verdict
+    short: str
+    sentence: str
+
+
+Rule = Callable[[RunFacts, HealthNumbers, Sequence[HealthSpan]], "Finding | None"]
+
+
+def _no_path(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """One pose is no path."""
+    poses = len(facts.trajectory)
+    if poses >= 2:
+        return None
+    text = "no frame has a pose" if poses == 0 else "a single frame has a pose"
+    return Finding(Verdict.NOT_TRUSTWORTHY, text, f"{text[0].upper()}{text[1:]}: there is no path.")
+
+
+def _losses(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """Lost frames are a hole, and only a relocalisation ties its two sides together.
+
+    A covered lens looks the same, and leaves the same hole. Few losses of less than a second each, as at a
+    blurred image, leave a result good.
+    """
+    share = numbers.lost_share or 0.0
+    if share < _SOME_LOST and numbers.longest_loss_s < LONG_S:
+        return None
+    level = Verdict.NOT_TRUSTWORTHY if share > _MUCH_LOST else Verdict.DOUBTFUL
+    where = _where(spans, SpanKind.LOST)
+    return Finding(
+        level,
+        f"{percent(share)} of the frames were lost ({where})",
+        f"The camera was lost for {percent(share)} of the frames: {where}. The longest loss took "
+        f"{numbers.longest_loss_s:.1f} s; the parts before and after a loss may not fit together.",
+    )
+
+
+def _leaps(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """A camera cannot leap, so one of the two poses, or all that follow, are wrong.
+
+    A real quick turn is confirmed by its neighbours, see :mod:`slamdepth.evaluation.leaps`. A cut in the
+    recording is not, so that a single place leaves a result doubtful.
+    """
+    if not numbers.leaps:
+        return None
+    where = _where(spans, SpanKind.LEAP)
+    many = numbers.leaps >= _MANY_LEAPS
+    text = f"{numbers.leaps} leap{'s' if numbers.leaps > 1 else ''}"
+    return Finding(
+        Verdict.NOT_TRUSTWORTHY if many else Verdict.DOUBTFUL,
+        f"{text} ({where})",
+        f"The path has {text} that no motion before or after confirms: {where}. Unless the recording was cut "
+        "there, poses next to it are wrong.",
+    )
+
+
+def _weak_tracking(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """Few inliers are few chances to notice wrong matches; for a second they are bridged by the motion."""
+    share = numbers.weak_share or 0.0
+    if not share:
+        return None
+    where = _where(spans, SpanKind.WEAK)
+    return Finding(
+        Verdict.NOT_TRUSTWORTHY if share > _MOSTLY else Verdict.DOUBTFUL,
+        f"weak tracking ({where})",
+        f"Fewer than {WEAK * facts.least_inliers} map points agreed with each pose for a second or more: "
+        f"{where}.",
+    )
+
+
+def _registration(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """A flat wall leaves three of six degrees of freedom open, and predicted depth is no measurement.
+
+    Standing before a white wall with a sensor is fine for a while: what does not move does not slide.
+    """
+    if not any(span.kind is SpanKind.REGISTERED for span in spans):
+        return None
+    share = numbers.registered_share or 0.0
+    where = _where(spans, SpanKind.REGISTERED)
+    is_much = not facts.depth_is_measured or share > _MUCH_REGISTERED
+    return Finding(
+        Verdict.DOUBTFUL if is_much else Verdict.GOOD,
+        f"{percent(share)} placed by depth alone ({where})",
+        f"The shape of the {'measured' if facts.depth_is_measured else 'predicted'} depth alone placed "
+        f"{percent(share)} of the frames: {where}. Along a flat wall such poses may slide.",
+    )
+
+
+def _late_start(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """Without a map there is no path. What follows a dark start can be sound, so this is only a doubt."""
+    share = numbers.no_map_share or 0.0
+    if share <= _LONG_START:
+        return None
+    where = _where(spans, SpanKind.NO_MAP)
+    return Finding(
+        Verdict.DOUBTFUL,
+        f"no map for {percent(share)} of the frames",
+        f"No map could be started for {percent(share)} of the frames: {where}.",
+    )
+
+
+def _keyframe_rate(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """A keyframe at nearly every frame: what was mapped is not found again in the very next image.
+
+    At a few frames a second every image is a new view, so such footage is not judged by this.
+    """
+    rate = numbers.frames_per_keyframe
+    placed = len(facts.trajectory)
+    if rate is None or placed < _FEW_FRAMES or rate >= _FRAMES_PER_KEYFRAME or facts.frame_s >= MAX_STEP_S:
+        return None
+    return Finding(
+        Verdict.DOUBTFUL,
+        "landmarks are hardly found again",
+        f"Every {rate:.1f} frames the map needed a new keyframe: landmarks are hardly found again.",
+    )
+
+
+def _refused_loops(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """Verified loops are wrong where places look alike, or right where the path has drifted.
+
+    Either way more loops contradict the path than agree with it. A few refused loops are the normal case.
+    """
+    refused, closed = numbers.loops_refused, numbers.loop_closures
+    if refused < _FEW_REFUSED or refused <= closed:
+        return None
+    return Finding(
+        Verdict.DOUBTFUL,
+        f"{refused} loops contradicted the path",
+        f"{refused} loops were refused because they contradict the path, {closed} were closed: either places "
+        "look alike here, or the path has drifted.",
+    )
+
+
+def _scale(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """Keyframes that disagree on the scale by more than the network's own errors: the map is not one size.
+
+    The scale itself is a matter of ``scale`` in the report: a wrong but common one leaves the shape right.
+    """
+    spread = numbers.scale_spread_log
+    if not facts.trajectory.is_metric:
+        return Finding(
+            Verdict.GOOD, "no unit", "The unit of length is unknown: the path has a shape, no size."
+        )
+    if spread is None or spread <= _SCALE_SPREAD_LOG:
+        return None
+    return Finding(
+        Verdict.DOUBTFUL,
+        "the scale varies along the path",
+        f"Keyframes disagree on the scale by a factor of {np.exp(spread):.1f} (one standard deviation).",
+    )
+
+
+def _sparse_footage(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """Says what could not be judged; that is no evidence against the result."""
+    share = numbers.judged_step_share
+    if share is None or share >= _MOSTLY:
+        return None
+    return Finding(
+        Verdict.GOOD,
+        "leaps not judged",
+        f"Most frames are over {MAX_STEP_S:g} s apart, so that leaps cannot be told from real motion.",
+    )
+
+
+RULES: tuple[Rule, ...] = (
+    _no_path,
+    _losses,
+    _leaps,
+    _weak_tracking,
+    _registration,
+    _late_start,
+    _keyframe_rate,
+    _refused_loops,
+    _scale,
+    _sparse_footage,
+)
+
+
+def _where(spans: Sequence[HealthSpan], kind: SpanKind) -> str:
+    """The longest spans of a kind, in order of time."""
+    chosen = [span for span in spans if span.kind is kind]
+    longest = sorted(chosen, key=lambda span: -span.duration_s)[:_SHOWN]
+    named = ", ".join(str(span) for span in sorted(longest, key=lambda span: span.from_s))
+    return f"{named}, ..." if len(chosen) > _SHOWN else named
+
+
+def percent(share: float) -> str:
+    """Whole per cents; never 0 for some, nor 100 for not all."""
+    whole = round(100 * share)
+    if share > 0 and whole == 0:
+        return "under 1 %"
+    return "over 99 %" if share < 1 and whole == 100 else f"{whole} %"
