@@ -60,6 +60,13 @@ def test_the_version() -> None:
     assert slamdepth("--version").stdout == f"slamdepth {package.__version__}\n"
 
 
+def test_a_run_says_first_whether_it_can_be_trusted(run_folder: Path, report: dict[str, Any]) -> None:
+    lines = [line for line in (run_folder / "stdout.txt").read_text().splitlines() if line.strip()]
+    assert lines[1].split()[:2] == ["verdict", "Reliable:"]
+    assert report["health"]["verdict"] == "good"
+    assert report["health"]["headline"] in (run_folder / "report.html").read_text(encoding="utf-8")
+
+
 def test_a_run_writes_everything_it_promises(run_folder: Path) -> None:
     promised = (
         "trajectory_online.txt trajectory.txt keyframes.txt mesh.ply mesh.png report.json report.html "

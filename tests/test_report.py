@@ -89,6 +89,35 @@ def test_summary_has_the_promised_keys_and_values() -> None:
     assert summary["hardware"]["cores"] >= 1
 
 
+def test_the_verdict_is_in_the_figures_with_reasons_spans_and_numbers() -> None:
+    health = json.loads(json.dumps(build_summary(full_data())["health"]))
+    assert list(health) == ["verdict", "headline", "reasons", "spans", "numbers"]
+    assert health["verdict"] == "doubtful"
+    assert [span["kind"] for span in health["spans"]] == ["no map yet", "lost"]
+    assert health["numbers"]["tracked_share"] == 70 / 80
+    assert health["numbers"].keys() == build_summary(bare_data())["health"]["numbers"].keys()
+
+
+def test_the_verdict_comes_first_on_the_page_and_in_the_table() -> None:
+    for data in (full_data(), bare_data()):
+        summary = build_summary(data)
+        headline = summary["health"]["headline"]
+        page = build_html(data, summary)
+        assert page.index(headline) < page.index('class="tiles"')
+        table = run_table(summary)
+        names, values = ([str(cell) for cell in column.cells] for column in table.columns)
+        assert names[0] == "verdict"
+        assert values[:2] == [headline, summary["health"]["reasons"][0]]
+        assert values[1] in page
+
+
+def test_reasons_of_a_good_result_stay_out_of_the_table() -> None:
+    summary = build_summary(full_data())
+    good = {**summary["health"], "verdict": "good"}
+    table = run_table({**summary, "health": good})
+    assert [str(cell) for cell in table.columns[0].cells][1] == "frames"
+
+
 def leaves(value: object, prefix: str = "") -> dict[str, object]:
     if not isinstance(value, dict):
         return {prefix: value}

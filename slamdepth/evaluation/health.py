@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from slamdepth.evaluation.health_facts import HealthNumbers, RunFacts, measure_health
-from slamdepth.evaluation.health_rules import RULES, WEAK, Finding, Verdict, percent
+from slamdepth.evaluation.health_rules import RULES, WEAK, Finding, Verdict, leaps_are_judged, percent
 from slamdepth.evaluation.health_spans import HealthSpan, find_spans
 from slamdepth.evaluation.leaps import find_leaps, scene_distance
 
@@ -68,9 +68,10 @@ def judge_run(facts: RunFacts) -> Health:
 def _headline(facts: RunFacts, numbers: HealthNumbers, verdict: Verdict, found: Sequence[Finding]) -> str:
     if verdict is Verdict.GOOD:
         run = facts.statistics
+        leaps = "without leaps" if leaps_are_judged(numbers) else "leaps were not judged"
         if run.tracked == run.frames:
-            return f"Reliable: every frame was tracked ({run.frames} of {run.frames}), without leaps."
+            return f"Reliable: every frame was tracked ({run.frames} of {run.frames}), {leaps}."
         share, longest_s = percent(numbers.tracked_share or 0.0), numbers.longest_loss_s
-        return f"Reliable: {share} of the frames were tracked, without leaps; longest loss {longest_s:.1f} s."
+        return f"Reliable: {share} of the frames were tracked, {leaps}; longest loss {longest_s:.1f} s."
     start = "Do not trust this result" if verdict is Verdict.NOT_TRUSTWORTHY else "Check this result"
     return f"{start}: {', '.join(finding.short for finding in found if finding.level is not Verdict.GOOD)}."

@@ -166,15 +166,17 @@ def _refused_loops(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Heal
     """Verified loops are wrong where places look alike, or right where the path has drifted.
 
     Either way more loops contradict the path than agree with it. A few refused loops are the normal case.
+    With measured depth the path drifts little, so that it is doubted only where loops have corrected it.
     """
     refused, closed = numbers.loops_refused, numbers.loop_closures
     if refused < _FEW_REFUSED or refused <= closed:
         return None
+    is_sure = facts.depth_is_measured and closed == 0
     return Finding(
-        Verdict.DOUBTFUL,
+        Verdict.GOOD if is_sure else Verdict.DOUBTFUL,
         f"{refused} loops contradicted the path",
-        f"{refused} loops were refused because they contradict the path, {closed} were closed: either places "
-        "look alike here, or the path has drifted.",
+        f"{refused} loops were refused because they contradict the path; loops closed: {closed}. Either "
+        "places look alike here, or the path has drifted.",
     )
 
 
@@ -199,8 +201,7 @@ def _scale(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan])
 
 def _sparse_footage(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
     """Says what could not be judged; that is no evidence against the result."""
-    share = numbers.judged_step_share
-    if share is None or share >= _MOSTLY:
+    if leaps_are_judged(numbers):
         return None
     return Finding(
         Verdict.GOOD,
@@ -221,6 +222,11 @@ RULES: tuple[Rule, ...] = (
     _scale,
     _sparse_footage,
 )
+
+
+def leaps_are_judged(numbers: HealthNumbers) -> bool:
+    """Whether most steps are short enough in time to be told from a leap."""
+    return numbers.judged_step_share is None or numbers.judged_step_share >= _MOSTLY
 
 
 def _where(spans: Sequence[HealthSpan], kind: SpanKind) -> str:
