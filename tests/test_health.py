@@ -179,7 +179,7 @@ def test_footage_at_two_frames_a_second_is_not_judged_by_leaps_nor_by_its_keyfra
     assert health.verdict is Verdict.GOOD
     assert health.numbers.judged_step_share == 0.0
     assert "leaps were not judged" in health.headline
-    assert "0.2 s apart" in health.reasons[0]
+    assert "0.25 s apart" in health.reasons[0]
 
 
 def test_lengths_are_compared_with_the_distance_of_the_scene() -> None:

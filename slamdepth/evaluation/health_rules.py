@@ -102,7 +102,10 @@ def _leaps(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan])
 
 
 def _weak_tracking(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
-    """Few inliers are few chances to notice wrong matches; for a second they are bridged by the motion."""
+    """With few inliers one group of wrong matches decides the pose.
+
+    A passing hand or a quick turn does the same for less than a second, which the motion bridges.
+    """
     share = numbers.weak_share or 0.0
     if not share:
         return None
@@ -118,7 +121,8 @@ def _weak_tracking(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Heal
 def _registration(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
     """A flat wall leaves three of six degrees of freedom open, and predicted depth is no measurement.
 
-    Standing before a white wall with a sensor is fine for a while: what does not move does not slide.
+    Standing before a white wall with a sensor looks the same. Measured depth fixes distance and tilt there,
+    so that only a large share is a doubt.
     """
     if not any(span.kind is SpanKind.REGISTERED for span in spans):
         return None
@@ -147,7 +151,7 @@ def _late_start(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthS
 
 
 def _keyframe_rate(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
-    """A keyframe at nearly every frame: what was mapped is not found again in the very next image.
+    """A keyframe at nearly every frame: what was mapped is hardly found in the very next image.
 
     At a few frames a second every image is a new view, so such footage is not judged by this.
     """
@@ -181,9 +185,10 @@ def _refused_loops(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Heal
 
 
 def _scale(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
-    """Keyframes that disagree on the scale by more than the network's own errors: the map is not one size.
+    """Keyframes that disagree on the scale by more than the network errs: the map is not of one size.
 
-    The scale itself is a matter of ``scale`` in the report: a wrong but common one leaves the shape right.
+    A single odd view is an outlier of the robust spread. A scale that is wrong everywhere leaves the shape
+    right; ``scale`` in the report says what is known of it.
     """
     spread = numbers.scale_spread_log
     if not facts.trajectory.is_metric:

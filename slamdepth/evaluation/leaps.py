@@ -9,7 +9,7 @@ from slamdepth.geometry import invert, so3_log, transform
 from slamdepth.types import Trajectory
 from slamdepth.typing import Bools, Floats, Ints
 
-MAX_STEP_S = 0.2
+MAX_STEP_S = 0.25
 """Over a longer time a hand can start and stop, so that the steps before and after say nothing."""
 
 _FASTER = 15.0  # than the median speed
@@ -57,7 +57,7 @@ def find_leaps(trajectory: Trajectory, distance: float | None) -> Ints:
     * which neither the step before nor the step after confirms by a quarter of its velocity in its direction:
       a camera has mass, so a real quick turn takes several frames.
 
-    Steps over more than 0.2 s (footage at a few frames a second, gaps of lost frames) are not judged, nor
+    Steps over more than 0.25 s (footage at a few frames a second, gaps of lost frames) are not judged, nor
     are steps without a judged neighbour. A cut in the recording looks the same as a leap.
 
     Args:
@@ -79,7 +79,7 @@ def _image_velocity(trajectory: Trajectory, distance: float | None) -> Floats:
     """``(N - 1, 6)`` angular velocity and velocity over the scene's distance, world frame, rad/s."""
     T = trajectory.T_world_camera
     R_step = T[1:, :3, :3] @ T[:-1, :3, :3].transpose(0, 2, 1)
-    turn = np.array([so3_log(R) for R in R_step]).reshape(-1, 3)
+    turn = so3_log(R_step)
     shift = np.diff(T[:, :3, 3], axis=0) / (np.inf if distance is None else distance)
     velocity: Floats = np.hstack([turn, shift]) / np.diff(trajectory.timestamps_s)[:, None]
     return velocity
