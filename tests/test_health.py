@@ -34,7 +34,8 @@ def wall() -> Floats:
     """Points around the path of :func:`walk`, two metres away."""
     rng = np.random.default_rng(1)
     direction = rng.normal(size=(4000, 3))
-    return SCENE_M * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    points: Floats = SCENE_M * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    return points
 
 
 def facts(

@@ -17,6 +17,7 @@ _LEAST_STEP_RAD = 0.05  # about 3 degrees of image motion: less is jitter, howev
 _CONFIRMED = 0.25  # of a step's velocity, found again in the step before or after
 _SAMPLES = 50  # cameras that the scene's distance is measured from
 _FEWEST_POINTS = 10
+_POINTS = 5000  # of the map, evenly chosen: the map of --odometry kiss-icp is a dense cloud
 
 
 def scene_distance(trajectory: Trajectory, points_w: Floats) -> float | None:
@@ -31,6 +32,7 @@ def scene_distance(trajectory: Trajectory, points_w: Floats) -> float | None:
         The median over cameras along the path; None where no camera has ten points in front of it.
     """
     count = len(trajectory)
+    points_w = points_w[:: max(1, len(points_w) // _POINTS)]
     depths: list[float] = []
     for n in np.unique(np.linspace(0, count - 1, min(count, _SAMPLES)).round().astype(int)):
         x, y, z = transform(invert(trajectory.T_world_camera[n]), points_w).T
