@@ -123,7 +123,7 @@ def test_a_loss_of_over_a_second_is_a_doubt_and_a_lost_blurred_frame_is_none() -
     assert long.headline.startswith("Check this result: ")
     short = judge_run(facts(states=states(COUNT, (60, 64, TrackingStatus.LOST))))
     assert short.verdict is Verdict.GOOD
-    assert short.headline == ("Reliable: 99 % of the frames were tracked, without leaps; longest loss 0.1 s.")
+    assert short.headline == ("Reliable: 99 % of the frames were tracked, without leaps; no loss over 0.2 s.")
     assert kinds(short) == [SpanKind.LOST]
 
 

@@ -7,6 +7,7 @@ verdict only where keyframes contradict one another.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -71,7 +72,8 @@ def _headline(facts: RunFacts, numbers: HealthNumbers, verdict: Verdict, found: 
         leaps = "without leaps" if leaps_are_judged(numbers) else "leaps were not judged"
         if run.tracked == run.frames:
             return f"Reliable: every frame was tracked ({run.frames} of {run.frames}), {leaps}."
-        lost = f"; longest loss {numbers.longest_loss_s:.1f} s" if numbers.longest_loss_s else ""
+        longest_s = math.ceil(10 * numbers.longest_loss_s) / 10
+        lost = f"; no loss over {longest_s:.1f} s" if longest_s else ""
         return f"Reliable: {percent(numbers.tracked_share or 0.0)} of the frames were tracked, {leaps}{lost}."
     start = "Do not trust this result" if verdict is Verdict.NOT_TRUSTWORTHY else "Check this result"
     return f"{start}: {', '.join(finding.short for finding in found if finding.level is not Verdict.GOOD)}."

@@ -54,7 +54,7 @@ def find_leaps(trajectory: Trajectory, distance: float | None) -> Ints:
     Rotation and translation are compared in one unit, the image motion they cause: an angle, and a length
     over the distance of the scene. A leap is a step of
 
-    * more than 15 times the median speed: a shake or a quick turn reaches about 8 times;
+    * more than 15 times the median speed: the quickest turn of the recordings looked at has 5 times;
     * more than 3 degrees: before a camera that stands still the median speed is close to 0;
     * which neither the step before nor the step after confirms by a quarter of its velocity in its direction:
       a camera has mass, so a real quick turn takes several frames.
