@@ -117,6 +117,13 @@ def test_much_of_a_recording_lost_is_not_to_be_trusted_and_is_named_by_its_secon
     assert health.numbers.longest_loss_s == pytest.approx(100 / FPS, abs=1e-3)
 
 
+def test_a_camera_that_is_never_found_again_is_said_to_be() -> None:
+    lost_at_the_end = judge_run(facts(states=states(COUNT, (200, COUNT, TrackingStatus.LOST))))
+    assert lost_at_the_end.reasons[0].endswith("it was not found again.")
+    found = judge_run(facts(states=states(COUNT, (100, 200, TrackingStatus.LOST))))
+    assert found.reasons[0].endswith("parts before and after may not fit together.")
+
+
 def test_a_loss_of_over_a_second_is_a_doubt_and_a_lost_blurred_frame_is_none() -> None:
     long = judge_run(facts(states=states(COUNT, (60, 95, TrackingStatus.LOST))))
     assert long.verdict is Verdict.DOUBTFUL

@@ -17,6 +17,7 @@ import numpy as np
 from slamdepth.evaluation.health_facts import HealthNumbers, RunFacts
 from slamdepth.evaluation.health_spans import LONG_S, HealthSpan, SpanKind
 from slamdepth.evaluation.leaps import MAX_STEP_S
+from slamdepth.types import TrackingStatus
 
 WEAK = 2
 """Times the least inliers that the tracker accepts: one group of wrong matches less, and it would be lost."""
@@ -74,11 +75,13 @@ def _losses(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]
         return None
     level = Verdict.NOT_TRUSTWORTHY if share > _MUCH_LOST else Verdict.DOUBTFUL
     where = _where(spans, SpanKind.LOST)
+    is_lost_at_the_end = bool(facts.steps) and facts.steps[-1].status is TrackingStatus.LOST
+    end = "it was not found again" if is_lost_at_the_end else "parts before and after may not fit together"
     return Finding(
         level,
         f"{percent(share)} of the frames were lost ({where})",
         f"The camera was lost for {percent(share)} of the frames: {where}. The longest loss took "
-        f"{numbers.longest_loss_s:.1f} s; the parts before and after a loss may not fit together.",
+        f"{numbers.longest_loss_s:.1f} s; {end}.",
     )
 
 
