@@ -53,10 +53,10 @@ class World:
 
     Args:
         turn_drift, shift_drift_m, scale_drift: radians, metres and share of the scale lost each step.
-        alone: no point is tracked from one keyframe to the next, so that each looks for loops.
+        alone: points are tracked to the next keyframe only, so that each keyframe looks for loops.
         seen_from: keyframes that see, in addition to their own place, another one's furniture as from this
             pose.
-        astray: keyframes before which odometry turns wrongly by ten degrees each; before the first of them
+        astray: radians by which odometry turns wrongly before a keyframe; before the first of these keyframes
             no point is tracked.
     """
 
@@ -70,14 +70,14 @@ class World:
         is_sensor: bool,
         alone: bool = False,
         seen_from: dict[int, Floats] | None = None,
-        astray: range = range(0),
+        astray: dict[int, float] | None = None,
     ) -> None:
         self.map = Map()
         self.closer = LoopCloser(CONFIG, self.map, Localiser(CAMERA, CONFIG, self.map))
         self._ids: dict[int, int] = {}  # landmarks of the points tracked at present
         self._turn_drift, self._scale_drift, self._is_sensor = turn_drift, scale_drift, is_sensor
         self._shift_drift_m, self._alone, self._seen_from = shift_drift_m, alone, seen_from or {}
-        self._astray = astray
+        self._astray = astray or {}
         self.closures: list[tuple[int, LoopClosure]] = []
         self._pose = np.eye(4)
         for _ in range(count):
@@ -89,12 +89,11 @@ class World:
         if k:
             step = invert(true_pose(k - 1)) @ true_pose(k)
             step[:3, 3] *= scale
-            wrongly = np.deg2rad(10.0) if k in self._astray else 0.0
-            drift = so3_exp(np.array([0.0, self._turn_drift + wrongly, 0.0]))
+            drift = so3_exp(np.array([0.0, self._turn_drift + self._astray.get(k, 0.0), 0.0]))
             step[:3, :3] = step[:3, :3] @ drift
             step[1, 3] += self._shift_drift_m
             self._pose = self.map.keyframes[-1].T_world_camera @ step
-        if k in self._astray[:1]:
+        if k == min(self._astray, default=-1):
             self._ids = {}
         descriptors = ring()[1]
         seen, px, z = view(true_pose(k))
@@ -130,8 +129,10 @@ class World:
         return closure
 
     def _track(self, seen: Ints, ids: Ints) -> None:
+        newest = len(self.map.keyframes) - 1
+        anchor = self.map.landmarks.anchor_keyframe
         known = zip(seen.tolist(), ids.tolist(), strict=True)
-        self._ids = {} if self._alone else {i: id_ for i, id_ in known if id_ >= 0}
+        self._ids = {i: id_ for i, id_ in known if id_ >= 0 and (not self._alone or anchor[id_] == newest)}
 
     def position_errors_m(self) -> Floats:
         estimate = self.map.T_world_camera[:, :3, 3]

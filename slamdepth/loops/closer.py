@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from slamdepth.backend.pose_graph import Edge, PoseGraphResult, optimise_pose_graph
 from slamdepth.config import Config
 from slamdepth.geometry import invert, rotation_angle_rad, transform
-from slamdepth.loops.consistency import RefusedLoops
-from slamdepth.loops.edges import MeasuredLoop, odometry_edges
+from slamdepth.loops.consistency import Drift, RefusedLoops
+from slamdepth.loops.edges import MeasuredLoop, odometry_edges, weakness
 from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map import Map, MapKeyframe
 from slamdepth.mapping.map_view import NEAREST_M
@@ -150,13 +150,13 @@ class LoopCloser:
             T_old = self._map.T_world_camera
             result = self._optimised(T_old, new)
             if result is None:
-                new = self._refused.confirmed(edge, T_old, with_scale=not self._map.is_measured)
+                drift = Drift(
+                    T_old, weakness(np.diagonal(self._map.covisibility(), 1)), self._map.is_measured
+                )
+                new = self._refused.confirmed(edge, drift)
                 result = self._optimised_after_drift(T_old, new)
             if result is None:
                 self._refused.add(edge)
-                new = self._refused.insisted(T_old, with_scale=not self._map.is_measured)
-                result = self._optimised_after_break(T_old, new)
-            if result is None:
                 log.info("loop %d-%d refused by the pose graph", candidate, keyframe.id)
                 return None
             scales = result.scales
@@ -166,9 +166,9 @@ class LoopCloser:
         self._map.fuse_view(keyframe, placement.landmark_ids)
         return scales
 
-    def _edges(self, looser: float = 1.0, *, after: int = -1) -> list[Edge]:
+    def _edges(self, looser: float) -> list[Edge]:
         units = self._map.units
-        odometry = odometry_edges(self._map, looser, after=after)
+        odometry = odometry_edges(self._map, looser)
         return [*odometry, *(loop.in_units(units) for loop in self._loops)]
 
     def _optimised(self, T_old: Floats, new: list[Edge], looser: float = 1.0) -> PoseGraphResult | None:
@@ -187,24 +187,6 @@ class LoopCloser:
                 log.info("%d loops agree on a large drift", len(confirmed))
                 return result
         return None
-
-    def _optimised_after_break(self, T_old: Floats, insisted: list[Edge]) -> PoseGraphResult | None:
-        """The pose graph where one keyframe after the other sees another place than odometry led to.
-
-        Odometry is believed up to where two keyframes share fewest landmarks, and hardly from there on.
-        """
-        if not insisted:
-            return None
-        together = self._map.covisibility()
-        before, after = max(edge.i for edge in insisted), min(edge.j for edge in insisted)
-        if before >= after:
-            return None
-        links = together[np.arange(before, after), np.arange(before + 1, after + 1)]
-        last_good = before + int(np.argmin(links))
-        edges = self._edges(_LOOSER[-1], after=last_good)
-        edges += [replace(edge, is_loop=False) for edge in insisted]
-        log.info("%d loops insist: odometry is not believed after keyframe %d", len(insisted), last_good)
-        return optimise_pose_graph(T_old, edges, with_scale=not self._map.is_measured)
 
 
 def _is_off(keyframe: MapKeyframe, placement: Placement, scale: float) -> bool:

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verified loops that the odometry calls impossible, kept until others say the same.
+"""Verified loops that contradict odometry, kept until others confirm them.
 
-After a large drift a true loop contradicts the odometry as much as a false one does. What
-tells them apart is that true ones agree with one another: seen from the next keyframes the
-same place lies where the first said (the pairwise consistency of Mangelson et al.,
-"Pairwise Consistent Measurement Set Maximization for Robust Multi-Robot Map Merging", 2018;
-ORB-SLAM asks for three consistent detections in a row).
+After a large drift a true loop contradicts the odometry as much as a false one does. True ones agree with
+one another: from the next keyframes the same place is seen where the first loop says (the pairwise
+consistency of Mangelson et al., "Pairwise Consistent Measurement Set Maximization for Robust Multi-Robot
+Map Merging", 2018; ORB-SLAM asks for three consistent detections in a row). But so do false ones: to walk
+along one of two identical desks is to walk along the other. So agreement counts only as far as odometry can
+have drifted, and loops that contradict odometry and one another are no evidence at all.
 """
 
 from __future__ import annotations
 
-from itertools import pairwise
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,9 +23,51 @@ from slamdepth.typing import Floats
 _AGREEING = 3  # keyframes that must see the same place
 _REMEMBERED = 12  # keyframes a refused loop is kept for: farther apart, drift hides agreement
 _AGREEMENT = 2.0  # deviations of every step between two loops that agree
-_INSISTING_AMONG = 6  # latest keyframes
-_STEP_RAD, _STEP_M = 0.6, 0.5  # that a camera may move from one keyframe to the next
-_DRIFT = 3.0  # deviations of every step that a loop may ask odometry to have erred by
+_DRIFT = 3.0  # deviations that odometry may have drifted by
+_STEADY = (0.003, 0.0, 0.003)  # radians, metres and log scale that every step may err by in one direction
+_STEADY_PATH = 0.03  # of the path
+_MEASURED = 0.5  # of all that, where a sensor measures the depth
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How far odometry may have drifted between keyframes.
+
+    Attributes:
+        T_world_camera: ``(K, 4, 4)`` poses of all keyframes.
+        weakness: ``(K - 1,)`` of each step, see :func:`~slamdepth.loops.edges.weakness`.
+        is_measured: a sensor's depth made the map: the scale cannot drift, and the pose drifts less.
+    """
+
+    T_world_camera: Floats
+    weakness: Floats
+    is_measured: bool
+
+    @property
+    def dimensions(self) -> int:
+        """Of rotation, translation and scale those that may drift."""
+        return 2 if self.is_measured else 3
+
+    def bound(self, i: int, j: int) -> tuple[float, float, float]:
+        """What may have been lost from keyframe ``i`` to ``j``: radians, metres, logarithm of the scale.
+
+        A random walk over the steps, and a share of the way in one direction.
+        """
+        weakness, centers = self.weakness[i:j], self.T_world_camera[i : j + 1, :3, 3]
+        walk = _DRIFT * float(np.sqrt(np.sum(weakness**2)))
+        path_m = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+        factor = _MEASURED if self.is_measured else 1.0
+        rotation, translation, log_scale = (
+            factor * (walk * sigma + steady * (j - i))
+            for sigma, steady in zip(STEP_SIGMAS, _STEADY, strict=True)
+        )
+        return rotation, translation + factor * _STEADY_PATH * path_m, log_scale
+
+    def explains(self, edge: Edge) -> bool:
+        """Whether the odometry between its keyframes may have drifted as much as a loop says."""
+        i, j = sorted((edge.i, edge.j))
+        error = _error(edge, self.T_world_camera)[: self.dimensions]
+        return all(e <= bound for e, bound in zip(error, self.bound(i, j), strict=False))
 
 
 class RefusedLoops:
@@ -42,37 +85,12 @@ class RefusedLoops:
         """Drop all, after the map was corrected."""
         self._edges.clear()
 
-    def insisted(self, T_world_camera: Floats, *, with_scale: bool) -> list[Edge]:
-        """The latest refused loops where they say that odometry is wrong now; else none.
-
-        Three of the last six keyframes have one, the camera could have moved between them as they say,
-        and odometry has it otherwise. Loops that agree with odometry about the motion between them may come
-        from a place that looks like another, see :meth:`confirmed`.
-
-        Args:
-            T_world_camera: ``(K, 4, 4)`` poses of all keyframes as they are.
-            with_scale: whether scale may have drifted too.
-        """
-        newest = max(self._edges, default=0)
-        latest = [self._edges[j] for j in sorted(self._edges) if j > newest - _INSISTING_AMONG]
-        pairs = list(pairwise(latest))
-        if len(latest) < _AGREEING or not all(_could_move(a, b, T_world_camera) for a, b in pairs):
-            return []
-        return [] if all(_agree(a, b, T_world_camera, with_scale) for a, b in pairs) else latest
-
-    def confirmed(self, edge: Edge, T_world_camera: Floats, *, with_scale: bool) -> list[Edge]:
-        """The loops that agree with ``edge``, itself last; empty where too few do.
-
-        Args:
-            T_world_camera: ``(K, 4, 4)`` poses of all keyframes as they are.
-            with_scale: whether scale may have drifted too.
-        """
-        if not _is_within(_error(edge, T_world_camera), _DRIFT * (edge.j - edge.i), with_scale):
+    def confirmed(self, edge: Edge, drift: Drift) -> list[Edge]:
+        """The loops that agree with ``edge``, itself last; empty where too few do or no drift explains it."""
+        if not drift.explains(edge):
             return []
         agreeing = [
-            other
-            for other in self._edges.values()
-            if other.j != edge.j and _agree(other, edge, T_world_camera, with_scale)
+            other for other in self._edges.values() if other.j != edge.j and _agree(other, edge, drift)
         ]
         return [*agreeing, edge] if len(agreeing) + 1 >= _AGREEING else []
 
@@ -82,19 +100,12 @@ def _similarity(edge: Edge) -> tuple[Floats, float]:
     return edge.T_i_j, edge.scale_i_j
 
 
-def _agree(other: Edge, edge: Edge, T_world_camera: Floats, with_scale: bool) -> bool:
+def _agree(other: Edge, edge: Edge, drift: Drift) -> bool:
     """Whether two loops say the same, as far as odometry between their ends can be trusted."""
     steps = abs(other.i - edge.i) + abs(other.j - edge.j)
-    through = _through(other, edge, T_world_camera)
-    return _is_within(_difference(_similarity(edge), through), _AGREEMENT * (1 + steps), with_scale)
-
-
-def _could_move(a: Edge, b: Edge, T_world_camera: Floats) -> bool:
-    """Whether a camera could move from where ``a`` places its keyframe to where ``b`` places a later one."""
-    there_a, there_b = (T_world_camera[edge.i] @ edge.T_i_j for edge in (a, b))
-    D, steps = invert(there_a) @ there_b, b.j - a.j
-    turned, moved_m = float(rotation_angle_rad(D[:3, :3])), float(np.linalg.norm(D[:3, 3]))
-    return turned <= steps * _STEP_RAD and moved_m <= steps * _STEP_M
+    difference = _difference(_similarity(edge), _through(other, edge, drift.T_world_camera))
+    bounds = [_AGREEMENT * (1 + steps) * sigma for sigma in STEP_SIGMAS[: drift.dimensions]]
+    return all(d <= bound for d, bound in zip(difference, bounds, strict=False))
 
 
 def _through(other: Edge, edge: Edge, T_world_camera: Floats) -> tuple[Floats, float]:
@@ -114,8 +125,3 @@ def _difference(a: tuple[Floats, float], b: tuple[Floats, float]) -> tuple[float
     """Between two similarities: radians, metres, absolute logarithm of the ratio of scales."""
     turned = float(rotation_angle_rad(a[0][:3, :3].T @ b[0][:3, :3]))
     return turned, float(np.linalg.norm(a[0][:3, 3] - b[0][:3, 3])), abs(float(np.log(a[1] / b[1])))
-
-
-def _is_within(error: tuple[float, float, float], steps: float, with_scale: bool) -> bool:
-    bounds = [steps * sigma for sigma in STEP_SIGMAS]
-    return all(e <= bound for e, bound in zip(error[: 3 if with_scale else 2], bounds, strict=False))

@@ -9,22 +9,32 @@ import numpy as np
 
 from slamdepth.backend.pose_graph import Edge
 from slamdepth.mapping.map_view import MapView
-from slamdepth.typing import Floats
+from slamdepth.typing import Floats, Ints
 
 STEP_SIGMAS = (0.01, 0.02, 0.02)
 """Deviation of the step from one keyframe to the next: radians, metres, natural logarithm of the scale."""
 
+_STRONG = 60  # shared landmarks from which on a step is known as well as STEP_SIGMAS say
+_MAX_WEAKNESS = 20.0
 _COVISIBLE = 80  # shared landmarks that make an edge
 _MAX_PARTNERS = 10  # earlier keyframes that one is tied to, not counting the one just before it
 
 
-def odometry_edges(map_: MapView, looser: float = 1.0, *, after: int = -1) -> list[Edge]:
+def weakness(shared: Ints) -> Floats:
+    """Factor on the deviations of a step between keyframes that share so many landmarks, 1 to 20.
+
+    Tracking by few landmarks, over a blurred turn or a gap, may err grossly; by hundreds it hardly errs.
+    """
+    return np.clip(_STRONG / np.maximum(shared, 1), 1.0, _MAX_WEAKNESS)
+
+
+def odometry_edges(map_: MapView, looser: float = 1.0) -> list[Edge]:
     """Edges between neighbours in time and between keyframes that share most landmarks.
 
     A keyframe's edges all come from the same observations, so each counts for its share only.
 
     Args:
-        looser: factor on the deviations of edges to keyframes after ``after``, by default of all.
+        looser: factor on all deviations; above 1, those of weak steps grow by :func:`weakness`, too.
     """
     keyframes = map_.keyframes
     together = map_.covisibility()
@@ -33,9 +43,11 @@ def odometry_edges(map_: MapView, looser: float = 1.0, *, after: int = -1) -> li
         shared = together[j, :j]
         best = np.argsort(-shared, kind="stable")[:_MAX_PARTNERS]
         partners = {j - 1, *best[shared[best] >= _COVISIBLE].tolist()}
-        factor = np.sqrt(len(partners)) * (looser if j > after else 1.0)
-        rotation, translation, log_scale = (sigma * factor for sigma in STEP_SIGMAS)
+        factor = np.full(j, np.sqrt(len(partners)))
+        if looser > 1.0:
+            factor *= looser * weakness(shared)
         for i in sorted(partners):
+            rotation, translation, log_scale = (float(sigma * factor[i]) for sigma in STEP_SIGMAS)
             T_i_j = keyframes[i].T_camera_world @ keyframe.T_world_camera
             edges.append(Edge(i, j, T_i_j, 1.0, (rotation, translation, log_scale)))
     return edges
