@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -178,6 +179,23 @@ def test_false_loops_that_agree_are_refused_where_no_drift_explains_them() -> No
     assert [is_true for is_true, _ in loops].count(False) >= 5
     assert not any(accepted for is_true, accepted in loops if not is_true)
     assert world.position_errors_m().max() < 0.01
+
+
+def test_a_refused_loop_leaves_no_trace() -> None:
+    """The map is that of a run without loop closing, to the last bit."""
+    aside = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, np.deg2rad(120.0), 0.0]))
+    seen_from = {k: aside @ true_pose(k) for k in range(TURN - 6, TURN - 1)}
+    with_loops, without = (World(TURN - 6, is_sensor=True, alone=True, seen_from=seen_from) for _ in range(2))
+    without.closer._config = Config.from_dict({"loops": {"enabled": False}})
+    loops = offered(with_loops)
+    for world in (with_loops, without):
+        for _ in range(5):
+            world.grow()
+    assert len(loops) >= 3
+    assert not any(accepted for _, accepted in loops)
+    for field in fields(with_loops.map.landmarks):
+        ours, theirs = (getattr(world.map.landmarks, field.name) for world in (with_loops, without))
+        np.testing.assert_array_equal(ours, theirs, field.name)
 
 
 def test_a_kept_loop_follows_the_metres_of_its_keyframes() -> None:

@@ -120,10 +120,7 @@ class LoopCloser:
             None where too few landmarks of the candidate's place are seen.
         """
         placement = self._verifier.from_keyframe(keyframe.features, candidate, minimum=_MIN_VERIFIED)
-        if placement is None:
-            return None
-        self._map.count_views(placement.expected_ids, placement.found_ids)
-        if placement.inliers < self._config.loops.min_inliers:
+        if placement is None or placement.inliers < self._config.loops.min_inliers:
             return None
         both = np.flatnonzero((placement.landmark_ids >= 0) & (keyframe.landmark_ids >= 0))
         both = both[placement.landmark_ids[both] != keyframe.landmark_ids[both]]
@@ -163,6 +160,7 @@ class LoopCloser:
             self._map.correct_similarities(result.T_world_camera, scales)
             self._refused.clear()
         self._loops += [MeasuredLoop.of(loop, units) for loop in new]
+        self._map.count_views(placement.expected_ids, placement.found_ids)
         self._map.fuse_view(keyframe, placement.landmark_ids)
         return scales
 
