@@ -193,6 +193,7 @@ def test_a_refused_loop_leaves_no_trace() -> None:
             world.grow()
     assert len(loops) >= 3
     assert not any(accepted for _, accepted in loops)
+    assert with_loops.closer.refused == len(loops)
     for field in fields(with_loops.map.landmarks):
         ours, theirs = (getattr(world.map.landmarks, field.name) for world in (with_loops, without))
         np.testing.assert_array_equal(ours, theirs, field.name)

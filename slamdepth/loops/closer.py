@@ -58,6 +58,7 @@ class LoopCloser:
     Attributes:
         places: index of keyframes by what they look like.
         count: loops closed; a revisit that links many keyframes in a row is one.
+        refused: verified loops that were not believed.
     """
 
     def __init__(self, config: Config, map_: Map, verifier: Verifier) -> None:
@@ -69,6 +70,7 @@ class LoopCloser:
         self._refused = RefusedLoops()
         self._last: tuple[int, int] | None = None
         self.count = 0
+        self.refused = 0
 
     def describe(self, features: Any) -> NDArray[np.float32]:
         """The place vector of an image's features; any thread may ask."""
@@ -154,6 +156,7 @@ class LoopCloser:
                 result = self._optimised_after_drift(T_old, new)
             if result is None:
                 self._refused.add(edge)
+                self.refused += 1
                 log.info("loop %d-%d refused by the pose graph", candidate, keyframe.id)
                 return None
             scales = result.scales

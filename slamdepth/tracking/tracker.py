@@ -305,6 +305,7 @@ class Tracker:
                 frames=self._steps,
                 tracked=len(self._frames),
                 loop_closures=self._integration.loops.count,
+                loops_refused=self._integration.loops.refused,
                 relocalisations=self._placed_by[PlacedBy.PLACE],
                 registrations=self._placed_by[PlacedBy.REGISTRATION],
                 timings_ms=self._watch.mean_ms(),
