@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sequences that begin later: a small file names another sequence and its first frame.
 
-``slamdepth run`` reads such a file as a sequence once this module is imported.
+:func:`slamdepth.run` reads such a file as a sequence inside :func:`readable_excerpts`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import yaml
 
 from slamdepth.datasets import Dataset, open_dataset
-from slamdepth.datasets.registry import register_reader
+from slamdepth.datasets.registry import READERS
 from slamdepth.errors import DatasetError
 from slamdepth.io import write_text
 from slamdepth.types import Camera, Frame
@@ -44,7 +46,6 @@ class Excerpt(Dataset):
         return replace(self._whole.read(self._start + index, with_depth=with_depth), index=index)
 
 
-@register_reader
 class ExcerptReader:
     """Opens the files of :func:`write_excerpt`."""
 
@@ -68,6 +69,16 @@ class ExcerptReader:
         if named["start"] >= len(whole):
             raise DatasetError(f"{whole.path}: has {len(whole)} frames, none from {named['start']} on")
         return Excerpt(whole, named["start"])
+
+
+@contextmanager
+def readable_excerpts() -> Iterator[None]:
+    """Let :func:`slamdepth.open_dataset` read the files of :func:`write_excerpt`."""
+    READERS.parts[ExcerptReader.name] = ExcerptReader()
+    try:
+        yield
+    finally:
+        del READERS.parts[ExcerptReader.name]
 
 
 def write_excerpt(folder: Path, sequence: Path, camera_file: Path | None, start: int) -> Path:

@@ -27,7 +27,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import slamdepth
 from benchmarks.command import comma_separated, errors_in_one_line, parser_of, progress_line
-from benchmarks.excerpt import write_excerpt
+from benchmarks.excerpt import readable_excerpts, write_excerpt
 from benchmarks.jobs import ROOT
 from benchmarks.markdown import markdown_table
 from benchmarks.record import environment
@@ -58,11 +58,12 @@ def run_recording(
     begun = time.perf_counter()
     try:
         excerpt = write_excerpt(work, recording.sequence, recording.camera_file, start)
-        frames = len(open_dataset(excerpt))
         output = work / f"{recording.name}-{start}"
-        result = slamdepth.run(
-            excerpt, output, config=config, mesh=False, overwrite=True, progress=progress
-        )  # fmt: skip
+        with readable_excerpts():
+            frames = len(open_dataset(excerpt))
+            result = slamdepth.run(
+                excerpt, output, config=config, mesh=False, overwrite=True, progress=progress
+            )
     except SlamdepthError as error:  # no frame could be placed, say; the other rows go on
         return {**about, "error": str(error), "wall_s": time.perf_counter() - begun}
     wall_s = time.perf_counter() - begun

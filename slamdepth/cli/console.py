@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -60,6 +60,12 @@ def print_places(out: Console, places: Mapping[str, object]) -> None:
     width = max(map(len, places))
     for name, place in places.items():
         out.print(f"  {name:<{width}}   {place}", markup=False, soft_wrap=True)
+
+
+def print_notes(out: Console, notes: Iterable[str]) -> None:
+    """Print notes, a line each that is never broken."""
+    for note in notes:
+        out.print(f"note: {note}", style="yellow", markup=False, soft_wrap=True)
 
 
 def error_console() -> Console:

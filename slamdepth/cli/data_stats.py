@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from slamdepth.cli.console import QuietOption, VerboseOption, console
+from slamdepth.cli.console import QuietOption, VerboseOption, console, print_notes
 from slamdepth.cli.options import StrideOption
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
@@ -49,8 +49,7 @@ def data_stats_command(
         out.print(table)
     if not quiet:
         for one in about["sets"]:
-            for note in one["notes"]:
-                out.print(f"note: {one['name']}: {note}", style="yellow", markup=False)
+            print_notes(out, [f"{one['name']}: {note}" for note in one["notes"]])
         if output is not None:
             for name in (PAGE, HISTOGRAMS, "data-stats.json"):
                 out.print(str(output / name), markup=False, soft_wrap=True)

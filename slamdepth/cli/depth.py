@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slamdepth.cli.console import QuietOption, VerboseOption, console, print_places
+from slamdepth.cli.console import QuietOption, VerboseOption, console, print_notes, print_places
 from slamdepth.cli.options import (
     CameraOption,
     DepthOption,
@@ -102,5 +102,4 @@ def _print_result(result: DepthMapResult, quiet: bool) -> None:
     out.print(two_columns(f"{about['source']['name']} · depth: {about['model']['name']}", rows))
     print_places(out, {"results": result.folder})
     if not quiet:
-        for note in about["notes"]:
-            out.print(f"note: {note}", style="yellow", markup=False)
+        print_notes(out, about["notes"])

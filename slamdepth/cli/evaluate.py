@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from slamdepth.cli.console import QuietOption, VerboseOption, console, show_log
+from slamdepth.cli.console import QuietOption, VerboseOption, console, print_notes, show_log
 
 
 def evaluate_command(
@@ -65,7 +65,6 @@ def evaluate_command(
     out = console()
     out.print(trajectory_table(figures, f"{estimate.name} against {ground_truth.name}"))
     if not quiet:
-        for note in notes:
-            out.print(f"note: {note}", style="yellow", markup=False)
+        print_notes(out, notes)
         if output is not None:
             out.print(f"figures: {output}", markup=False)

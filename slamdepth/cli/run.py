@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slamdepth.cli.console import QuietOption, VerboseOption, console, print_places
+from slamdepth.cli.console import QuietOption, VerboseOption, console, print_notes, print_places
 from slamdepth.cli.options import CameraOption, DepthWeightsOption, MaxFramesOption, StrideOption
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
@@ -200,5 +200,4 @@ def _print_result(result: RunResult, quiet: bool) -> None:
     out.print(run_table(result.summary))
     print_places(out, places)
     if not quiet:
-        for note in result.summary["notes"]:
-            out.print(f"note: {note}", style="yellow", markup=False)
+        print_notes(out, result.summary["notes"])
