@@ -79,18 +79,24 @@ class Dataset(Protocol):
         """
         for index in range(len(self)):
             try:
-                frame = _read_with_sound_depth(self, index) if with_depth else self.read(index)
+                frame, depth_error = read_sound(self, index, with_depth=with_depth)
             except ImageDecodeError as error:
                 _log.warning("image skipped: %s", error)
-            else:
-                yield frame
+                continue
+            if depth_error is not None:
+                _log.warning("depth of frame %d left out: %s", index, depth_error)
+            yield frame
 
 
-def _read_with_sound_depth(dataset: Dataset, index: int) -> Frame:
-    """The frame ``index``, without its depth where only that does not decode."""
+def read_sound(dataset: Dataset, index: int, *, with_depth: bool) -> tuple[Frame, ImageDecodeError | None]:
+    """The frame ``index``; without its depth, and with the error, where only that does not decode.
+
+    Raises:
+        IndexError, ImageDecodeError, CameraError: as :meth:`Dataset.read`, of the colour image.
+    """
     try:
-        return dataset.read(index, with_depth=True)
+        return dataset.read(index, with_depth=with_depth), None
     except ImageDecodeError as error:
-        frame = dataset.read(index)  # raises again where it is the colour image
-        _log.warning("depth of frame %d left out: %s", index, error)
-        return frame
+        if not with_depth:
+            raise
+        return dataset.read(index), error  # raises again where it is the colour image

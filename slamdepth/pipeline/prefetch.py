@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Any
 
 from slamdepth.datasets import Dataset
+from slamdepth.datasets.base import read_sound
 from slamdepth.errors import ImageDecodeError
 from slamdepth.types import Frame
 
@@ -104,12 +105,8 @@ class FramePrefetcher:
         self._put(None)
 
     def _read(self, index: int) -> Frame:
-        if not self._with_depth:
-            return self._dataset.read(index)
-        try:
-            frame = self._dataset.read(index, with_depth=True)
-        except ImageDecodeError as error:
-            frame = self._dataset.read(index)  # raises again where it is the colour image
+        frame, error = read_sound(self._dataset, index, with_depth=self._with_depth)
+        if error is not None:
             self.broken_depth_images += 1
             level = logging.WARNING if self.broken_depth_images <= _WARNINGS else logging.DEBUG
             logger.log(level, "depth of frame %d left out: %s", index, error)
