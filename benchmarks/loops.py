@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks.command import comma_separated, errors_in_one_line, parser_of, progress_line
 from benchmarks.depth_cache import default_cache
-from benchmarks.loops_closed import closed_loops, counting_refusals, covisibility
+from benchmarks.loops_closed import closed_loops, covisibility
 from benchmarks.loops_truth import judge_loops, true_keyframes
 from benchmarks.markdown import markdown_table
 from benchmarks.record import environment
@@ -77,7 +77,7 @@ def run(recording: Recording, depth: str, start: int, *, with_loops: bool) -> di
     seed_torch(config.seed)
     frames = range(start, len(dataset))
     try:
-        with Tracker(dataset.camera, model, config) as tracker, counting_refusals() as refusals:
+        with Tracker(dataset.camera, model, config) as tracker:
             for index in frames:
                 tracker.step(dataset.read(index, with_depth=depth == "sensor"))
             found = tracker.finish()
@@ -103,7 +103,7 @@ def run(recording: Recording, depth: str, start: int, *, with_loops: bool) -> di
         "keyframes": len(found.keyframes),
         "loop_closures": found.statistics.loop_closures,
         **judged,
-        "refused": refusals.count,
+        "refused": found.statistics.loops_refused,
         "ate": max(errors, default=None),
         "wall_s": wall_s,
     }

@@ -285,7 +285,7 @@ def test_no_loop_between_two_places_that_only_look_alike() -> None:
 def test_a_keyframe_is_tied_to_those_it_shares_most_with_and_no_others() -> None:
     """Walking through one room for hours would otherwise tie each keyframe to every other."""
     world = World(3 * TURN, is_sensor=True)
-    edges = odometry_edges(world.map)
+    edges = odometry_edges(world.map, world.map.covisibility())
     together = world.map.covisibility()
     for j in range(1, len(together)):
         partners = [edge.i for edge in edges if edge.j == j]

@@ -19,7 +19,7 @@ from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map import Map, MapKeyframe
 from slamdepth.mapping.map_view import NEAREST_M
 from slamdepth.mapping.placement import Placement
-from slamdepth.typing import Floats
+from slamdepth.typing import Floats, Ints
 
 log = logging.getLogger(__name__)
 
@@ -146,14 +146,12 @@ class LoopCloser:
         scales = np.ones(len(self._map.keyframes))
         units = self._map.units
         if _is_off(keyframe, placement, scale):
-            T_old = self._map.T_world_camera
-            result = self._optimised(T_old, new)
+            T_old, together = self._map.T_world_camera, self._map.covisibility()
+            result = self._optimised(T_old, together, new)
             if result is None:
-                drift = Drift(
-                    T_old, weakness(np.diagonal(self._map.covisibility(), 1)), self._map.is_measured
-                )
+                drift = Drift(T_old, weakness(np.diagonal(together, 1)), self._map.is_measured)
                 new = self._refused.confirmed(edge, drift)
-                result = self._optimised_after_drift(T_old, new)
+                result = self._optimised_after_drift(T_old, together, new)
             if result is None:
                 self._refused.add(edge)
                 self.refused += 1
@@ -167,23 +165,24 @@ class LoopCloser:
         self._map.fuse_view(keyframe, placement.landmark_ids)
         return scales
 
-    def _edges(self, looser: float) -> list[Edge]:
-        units = self._map.units
-        odometry = odometry_edges(self._map, looser)
-        return [*odometry, *(loop.in_units(units) for loop in self._loops)]
-
-    def _optimised(self, T_old: Floats, new: list[Edge], looser: float = 1.0) -> PoseGraphResult | None:
+    def _optimised(
+        self, T_old: Floats, together: Ints, new: list[Edge], looser: float = 1.0
+    ) -> PoseGraphResult | None:
         """The pose graph with the loops ``new``; None where one of them is an outlier."""
-        edges = [*self._edges(looser), *new]
+        units = self._map.units
+        kept = [loop.in_units(units) for loop in self._loops]
+        edges = [*odometry_edges(self._map, together, looser), *kept, *new]
         result = optimise_pose_graph(T_old, edges, with_scale=not self._map.is_measured)
         return result if result.is_inlier[-len(new) :].all() else None
 
-    def _optimised_after_drift(self, T_old: Floats, confirmed: list[Edge]) -> PoseGraphResult | None:
+    def _optimised_after_drift(
+        self, T_old: Floats, together: Ints, confirmed: list[Edge]
+    ) -> PoseGraphResult | None:
         """The pose graph with odometry believed less, where several loops agree that odometry drifted."""
         if not confirmed:
             return None
         for looser in _LOOSER:
-            result = self._optimised(T_old, confirmed, looser)
+            result = self._optimised(T_old, together, confirmed, looser)
             if result is not None:
                 log.info("%d loops agree on a large drift", len(confirmed))
                 return result

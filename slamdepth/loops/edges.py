@@ -28,16 +28,16 @@ def weakness(shared: Ints) -> Floats:
     return np.clip(_STRONG / np.maximum(shared, 1), 1.0, _MAX_WEAKNESS)
 
 
-def odometry_edges(map_: MapView, looser: float = 1.0) -> list[Edge]:
+def odometry_edges(map_: MapView, together: Ints, looser: float = 1.0) -> list[Edge]:
     """Edges between neighbours in time and between keyframes that share most landmarks.
 
     A keyframe's edges all come from the same observations, so each counts for its share only.
 
     Args:
+        together: ``(K, K)`` landmarks that each two keyframes share, see :meth:`MapView.covisibility`.
         looser: factor on all deviations; above 1, those of weak steps grow by :func:`weakness`, too.
     """
     keyframes = map_.keyframes
-    together = map_.covisibility()
     edges = []
     for j, keyframe in enumerate(keyframes[1:], start=1):
         shared = together[j, :j]
