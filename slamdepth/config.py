@@ -59,6 +59,10 @@ class TrackingConfig(_Section):
     depth_delay: int = Field(
         10, ge=0, le=30, description="frames after a keyframe until its predicted depth joins the map"
     )
+    new_maps: bool = Field(
+        True,
+        description="start a new map where the camera stays lost; joined with the others where they meet",
+    )
 
 
 class ShutterConfig(_Section):

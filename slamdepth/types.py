@@ -242,6 +242,8 @@ class StepResult:
         is_keyframe: True where the frame became a keyframe.
         keyframes, loop_closures: totals so far.
         timings_ms: wall time of each stage in milliseconds.
+        map_id: the map whose world frame the pose is in, numbered from 0 as maps are started. Where maps
+            have been joined, that of the one that went on.
     """
 
     index: int
@@ -253,6 +255,7 @@ class StepResult:
     keyframes: int = 0
     loop_closures: int = 0
     timings_ms: dict[str, float] = field(default_factory=dict)
+    map_id: int = 0
 
 
 @dataclass(frozen=True)
@@ -287,7 +290,7 @@ class RunStatistics:
 
     Attributes:
         frames: frames given to the tracker.
-        tracked: frames that have a pose.
+        tracked: frames that have a pose in this map.
         loop_closures, relocalisations, registrations: how often a loop was closed, and how many frames were
             placed by relocalisation and by point-cloud registration.
         loops_refused: verified loops that were not closed, because they contradict the path.
@@ -298,6 +301,7 @@ class RunStatistics:
         readout_sigma_s: standard deviation of ``readout_s`` in seconds; None where it was not estimated.
         scale_votes: log ratio of the map's depth to the predicted depth, one per keyframe with enough
             points; their robust centre is 0 at the map's own scale. Empty with a sensor.
+        maps_joined: how often two maps of the run became one.
     """
 
     frames: int = 0
@@ -311,3 +315,4 @@ class RunStatistics:
     readout_sigma_s: float | None = None
     scale_votes: tuple[float, ...] = ()
     loops_refused: int = 0
+    maps_joined: int = 0

@@ -29,6 +29,8 @@ class Reconstruction:
             None where they do not, or disagree.
         notes: what a reader of the result should know, one line each.
         statistics: counts and times of the run.
+        others: maps of the same run that never met this one, the largest first. Each has its own world
+            frame and its own scale, and its statistics count what is in it.
     """
 
     trajectory: Trajectory
@@ -37,6 +39,7 @@ class Reconstruction:
     gravity_w: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = ()
     statistics: RunStatistics = field(default_factory=RunStatistics)
+    others: tuple[Reconstruction, ...] = ()
 
     def fuse_mesh(
         self,
