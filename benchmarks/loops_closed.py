@@ -25,11 +25,11 @@ class ClosedLoop:
 
 def closed_loops(tracker: Tracker) -> list[ClosedLoop]:
     """The loops that ``tracker``, which has finished, accepted and did not take back."""
-    units = tracker._map.units
-    edges = [loop.in_units(units) for loop in tracker._integration.loops._loops]
+    units = tracker._active.map.units
+    edges = [loop.in_units(units) for loop in tracker._active.integration.loops._loops]
     return [ClosedLoop(edge.i, edge.j, edge.T_i_j) for edge in edges]
 
 
 def covisibility(tracker: Tracker) -> Ints:
     """How many landmarks each two keyframes share, ``(K, K)``."""
-    return tracker._map.covisibility()
+    return tracker._active.map.covisibility()

@@ -62,12 +62,12 @@ class TrackerMemory:
     def of(cls, tracker: Tracker) -> TrackerMemory:
         """Add up the arrays in the private parts of ``tracker``, after its threads are done."""
         tracker._workers.between.wait()
-        map_ = tracker._map
+        map_ = tracker._active.map
         return cls(
             images=map_._store.resident_bytes / _MIB,
             features=sum(map(_array_bytes, map_._states)) / _MIB,
             landmarks=_array_bytes(map_._own) / _MIB,
-            observations=tracker._frames.size_bytes / _MIB,
+            observations=tracker._active.frames.size_bytes / _MIB,
             on_disk=map_._store.spilled_bytes / _MIB,
         )
 

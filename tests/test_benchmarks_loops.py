@@ -112,7 +112,7 @@ def test_a_finished_tracker_tells_its_loops(tiny_room: Path) -> None:
     with Tracker(dataset.camera, SensorDepth()) as tracker:
         for frame in dataset:
             tracker.step(frame)
-        tracker._integration.loops.refused += 2
+        tracker._active.integration.loops.refused += 2
         found = tracker.finish()
     assert closed_loops(tracker) == []
     assert found.statistics.loops_refused == 2

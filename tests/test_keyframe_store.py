@@ -231,11 +231,11 @@ def test_compacting_the_landmarks_changes_nothing(monkeypatch: pytest.MonkeyPatc
     results, sizes, pruned_at = [], [], []
     for compact_at in (10**9, 64):
         run = scene.Run([], scene.ConstantDepth())
-        run.slam._map._compact_at = compact_at
+        run.slam._active.map._compact_at = compact_at
         for frame in scene.frames(change=scene.colour_only):
             run.tracker.step(frame)
-        sizes.append(run.slam._map.size)
-        pruned_at.append(run.slam._frames._prune_at)
+        sizes.append(run.slam._active.map.size)
+        pruned_at.append(run.slam._active.frames._prune_at)
         results.append(run.finish())
     assert sizes[1] < 0.8 * sizes[0]
     assert pruned_at[0] == 16 < pruned_at[1]

@@ -151,7 +151,7 @@ def test_a_frame_that_shows_nothing_is_not_registered_by_what_a_network_makes_up
     assert {statuses[n] for n in range(7, COUNT, 15)} == {LOST}
     assert not any(run.results[n].is_keyframe for n in range(7, COUNT, 15))
     assert LOST not in {statuses[n] for n in range(COUNT) if n % 15 != 7}
-    assert np.isfinite([keyframe.scale for keyframe in run.slam._map.keyframes]).all()
+    assert np.isfinite([keyframe.scale for keyframe in run.slam._active.map.keyframes]).all()
 
 
 def registered(*, instant: bool, frames: int, **more: bool) -> list[int]:
@@ -195,7 +195,7 @@ def test_a_place_that_looks_alike_is_tried_before_depth_is_registered(
     run = Run(frames(range(40)))
     tracker = run.slam
     newest = run.results[-1].keyframes - 1
-    by_keyframe = tracker._localiser.from_keyframe
+    by_keyframe = tracker._active.localiser.from_keyframe
 
     def not_from_the_newest(features: Any, k: int, **how: Any) -> Any:
         return None if k == newest else by_keyframe(features, k, **how)
@@ -203,23 +203,23 @@ def test_a_place_that_looks_alike_is_tried_before_depth_is_registered(
     def elsewhere(*_: Any, **__: Any) -> Any:
         return se3_exp(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
-    monkeypatch.setattr(tracker._localiser, "track", lambda *_: None)
-    monkeypatch.setattr(tracker._localiser, "from_keyframe", not_from_the_newest)
-    monkeypatch.setattr(tracker._relocaliser._clouds, "register", elsewhere)
+    monkeypatch.setattr(tracker._active.localiser, "track", lambda *_: None)
+    monkeypatch.setattr(tracker._active.localiser, "from_keyframe", not_from_the_newest)
+    monkeypatch.setattr(tracker._active.relocaliser._clouds, "register", elsewhere)
     result = tracker.step(played(frames([*range(40), 2]))[-1])
     assert result.status is TrackingStatus.RELOCALISED
     assert result.T_world_camera is not None
     before = run.results[2].T_world_camera
     assert before is not None
     np.testing.assert_allclose(result.T_world_camera, before, atol=0.02)
-    assert np.array_equal(tracker._motion.step, np.eye(4))
+    assert np.array_equal(tracker._active.motion.step, np.eye(4))
 
 
 @pytest.mark.parametrize(("kept", "is_believed"), [(30, False), (60, True)])
 def test_few_landmarks_of_many_do_not_place_a_lost_camera(kept: int, is_believed: bool) -> None:
     """Thirty of the hundreds of landmarks in view also agree with a wrong pose."""
     run = Run(frames(range(40)))
-    localiser, features = run.slam._localiser, run.slam.prepare(frames([2])[0]).features
+    localiser, features = run.slam._active.localiser, run.slam.prepare(frames([2])[0]).features
     seen = localiser.from_keyframe(features, 0)
     assert seen is not None
     rng = np.random.default_rng(0)

@@ -88,7 +88,7 @@ def test_slow_threads_change_nothing(seed: int, monkeypatch: pytest.MonkeyPatch)
 
 def test_a_keyframe_made_while_a_window_is_adjusted_moves_along() -> None:
     run = Run(frames(range(60), colour_only), LateDepth(0, 0.0))
-    map_, integration = run.slam._map, run.slam._integration
+    map_, integration = run.slam._active.map, run.slam._active.integration
     run.slam._workers.between.wait()
     integration.run_all()
     newest = map_.keyframes[-1]

@@ -94,10 +94,12 @@ def test_landmarks_are_created_between_two_frames_without_another_step() -> None
             if result.is_keyframe and result.keyframes == 5:
                 due = frame.index + config.tracking.depth_delay
             if due and frame.index == due - 1:
-                before = tracker._map.size  # the step has returned although the next one needs the depth
+                before = (
+                    tracker._active.map.size
+                )  # the step has returned although the next one needs the depth
                 model.may_go.set()
                 tracker._workers.between.wait()
-                after = tracker._map.size
+                after = tracker._active.map.size
         assert 0 < before < after
         assert len(tracker.finish().trajectory) > 0
 

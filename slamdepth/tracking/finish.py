@@ -14,14 +14,16 @@ from slamdepth.depth.robust_centre import robust_centre
 from slamdepth.geometry import invert
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.map import Map, MapKeyframe
+from slamdepth.mapping.placement import PlacedBy
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.stopwatch import Stopwatch
 from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.integration import KeyframeIntegration
 from slamdepth.tracking.local_mapper import LocalMapper
+from slamdepth.tracking.map_tracker import MapTracker
 from slamdepth.tracking.rolling_shutter import RollingShutter
-from slamdepth.tracking.workers import in_parallel
+from slamdepth.tracking.workers import DepthWorker, in_parallel
 from slamdepth.types import RunStatistics
-from slamdepth.typing import Floats
 
 _SEARCHED_AGAIN = 6  # neighbours of each keyframe; twice as many gain nothing measurable
 _PASSES = 3  # after the first adjustment; more than one only while the readout time changes
@@ -41,6 +43,48 @@ class FinalMap:
 
     notes: tuple[str, ...]
     scale_votes: tuple[float, ...]
+
+
+def finish_map(
+    tracked: MapTracker, depth: DepthWorker, config: Config, watch: Stopwatch, steps: int
+) -> Reconstruction:
+    """Adjust the whole map, make it metric, and return it with the pose of every frame placed in it.
+
+    Args:
+        steps: frames given to the tracker.
+    """
+    integration, map_, frames, shutter = (
+        tracked.integration, tracked.map, tracked.frames, tracked.shutter,
+    )  # fmt: skip
+    integration.run_all()
+    with watch.timed("final"):
+        final = optimise_map(map_, integration, frames, shutter, config)
+    statistics = RunStatistics(
+        frames=steps,
+        tracked=len(frames),
+        loop_closures=integration.loops.count,
+        loops_refused=integration.loops.refused,
+        relocalisations=tracked.placed_by[PlacedBy.PLACE],
+        registrations=tracked.placed_by[PlacedBy.REGISTRATION],
+        timings_ms=watch.mean_ms(),
+        timing_calls=watch.calls(),
+        readout_s=shutter.readout_s,
+        readout_sigma_s=shutter.sigma_s,
+        scale_votes=final.scale_votes,
+    )
+    # NumPy and the disk work in other threads while this one refines frames
+    with in_parallel(partial(_final, mapper=integration.mapper), map_.keyframes) as making:
+        if config.bundle.final:
+            frames.refine(shutter.readout_s)
+        keyframes = tuple(made.result() for made in making)
+    return Reconstruction(
+        trajectory=frames.trajectory(),
+        keyframes=keyframes,
+        points_m=map_.landmarks.position_w[map_.seen_by(2)],
+        gravity_w=depth.gravity_w(),
+        notes=final.notes,
+        statistics=statistics,
+    )
 
 
 def optimise_map(
@@ -126,37 +170,6 @@ def _scale_vote(map_: Map, keyframe: MapKeyframe) -> float | None:
     if np.count_nonzero(ok) < 20:
         return None
     return float(np.median(np.log(z[ok]) - predicted[ok]))
-
-
-def build_reconstruction(
-    map_: Map,
-    mapper: LocalMapper,
-    frames: FrameLog,
-    statistics: RunStatistics,
-    *,
-    notes: tuple[str, ...] = (),
-    gravity_w: Floats | None = None,
-    refine_frames: bool,
-) -> Reconstruction:
-    """The result of a run.
-
-    Args:
-        gravity_w: ``(3,)`` unit direction in the world frame, or None.
-        refine_frames: optimise the poses of ordinary frames in the final map.
-    """
-    # NumPy and the disk work in other threads while this one refines frames
-    with in_parallel(partial(_final, mapper=mapper), map_.keyframes) as making:
-        if refine_frames:
-            frames.refine(statistics.readout_s or 0.0)
-        keyframes = tuple(made.result() for made in making)
-    return Reconstruction(
-        trajectory=frames.trajectory(),
-        keyframes=keyframes,
-        points_m=map_.landmarks.position_w[map_.seen_by(2)],
-        gravity_w=gravity_w,
-        notes=notes,
-        statistics=statistics,
-    )
 
 
 def _final(keyframe: MapKeyframe, mapper: LocalMapper) -> Keyframe:

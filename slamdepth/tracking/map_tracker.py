@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One map: the parts that grow it, and how a frame is placed in it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamdepth.config import Config
+from slamdepth.frontend.features import Features, ScaleLevels
+from slamdepth.geometry import orthonormalised
+from slamdepth.mapping.map import Map
+from slamdepth.mapping.map_keyframe import AnchoredPose
+from slamdepth.mapping.placement import PlacedBy, Placement
+from slamdepth.stopwatch import Stopwatch
+from slamdepth.tracking.frame_log import FrameLog
+from slamdepth.tracking.integration import KeyframeIntegration
+from slamdepth.tracking.localiser import Localiser
+from slamdepth.tracking.motion import MotionModel
+from slamdepth.tracking.relocaliser import Relocaliser
+from slamdepth.tracking.rolling_shutter import RollingShutter
+from slamdepth.tracking.workers import Workers
+from slamdepth.types import Camera, Frame
+
+_SAME_MOTION = 0.8  # of a frame's landmarks agree still; of consecutive frames 0.92 and more
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A frame that was placed.
+
+    Attributes:
+        placement: its pose in the map as it is now.
+        placed_by: how it was found.
+        is_keyframe: True where it became a keyframe.
+    """
+
+    placement: Placement
+    placed_by: PlacedBy
+    is_keyframe: bool
+
+
+class MapTracker:
+    """Tracks the camera in one map, and grows the map.
+
+    Args:
+        levels: pyramid levels of the extractor.
+        workers, watch: shared by the maps of a run.
+
+    Attributes:
+        map, frames, motion, shutter, localiser, integration, relocaliser: the parts, of this map alone.
+        placed_by: how many frames were placed by what.
+    """
+
+    def __init__(
+        self, camera: Camera, config: Config, levels: ScaleLevels, workers: Workers, watch: Stopwatch
+    ) -> None:
+        self._config = config
+        self._workers = workers
+        self._watch = watch
+        self.map = Map(config.map.keyframe_memory_mib)
+        self.frames = FrameLog(camera, self.map)
+        self.motion = MotionModel()
+        self.shutter = RollingShutter(camera, config.shutter, self.map)
+        self.localiser = Localiser(camera, config, self.map, levels)
+        self.integration = KeyframeIntegration(
+            camera,
+            config,
+            self.map,
+            self.localiser,
+            self.frames,
+            self.shutter,
+            workers,
+            watch,
+        )
+        self.relocaliser = Relocaliser(
+            camera,
+            config,
+            self.map,
+            self.localiser,
+            self.integration.loops.places,
+            workers.depth,
+        )
+        self.placed_by: Counter[PlacedBy] = Counter()
+
+    def start(self, frame: Frame, features: Features) -> Placed | None:
+        """Start the map with a frame; None where its depth does not create enough landmarks."""
+        need = self._config.tracking.min_inliers
+        depth = self._workers.depth
+        if len(features) < need or not depth.has_depth(frame):
+            return None
+        if self.integration.mapper.count_creatable(features, depth.take(frame)) < need:
+            return None
+        origin = Placement(np.eye(4), np.full(len(features), -1, dtype=np.int64))
+        placement = self._add_keyframe(frame, features, origin)
+        self.frames.add(frame.timestamp_s, features, placement, is_keyframe=True)
+        return Placed(placement, PlacedBy.MOTION, is_keyframe=True)
+
+    def track(self, frame: Frame, raw: Features) -> Placed | None:
+        """Place a frame in the map, and make it a keyframe where the view has moved on.
+
+        Returns:
+            None where the camera is lost.
+        """
+        self._compact()
+        with self._watch.timed("tracking"):
+            features = self.shutter.correct_by_motion(raw, self.motion, frame.timestamp_s)
+            placement = self._place(frame, features)
+            if placement is None:
+                self._lose()
+                return None
+            placed_by = placement.placed_by
+            features, placement = self._correct_by_pose(frame, raw, features, placement)
+        return self._add(frame, raw, features, placement, placed_by)
+
+    def _add(
+        self, frame: Frame, raw: Features, features: Features, placement: Placement, placed_by: PlacedBy
+    ) -> Placed:
+        """Add a placed frame to the log, and to the map where the view has moved on."""
+        follows_motion = self.motion.is_known
+        is_keyframe = self.integration.wants(placement) and self._workers.depth.has_depth(frame)
+        if is_keyframe and self.integration.is_full:
+            placement = self._place_in_grown_map(features, placement)
+            is_keyframe = self.integration.wants(placement)
+        if is_keyframe:
+            placement = self._add_keyframe(frame, features, placement)
+        else:
+            self.motion.advance(frame.timestamp_s, placement.T_camera_world)
+            self.motion.anchor(placement, self.map.keyframes[-1])
+        self.frames.add(frame.timestamp_s, raw, placement, is_keyframe, follows_motion=follows_motion)
+        return Placed(placement, placed_by, is_keyframe)
+
+    def run_stage(self) -> None:
+        """Go on with the integration of keyframes before the next frame."""
+        self.integration.run_stage()
+        self.motion.follow_map()
+
+    def _place(self, frame: Frame, features: Features) -> Placement | None:
+        """Every way to place a frame, the cheapest first; None where it is lost."""
+        T_guess = None
+        placement = None
+        newest = None
+        if self.motion.is_known:
+            placement = self._track_motion(frame, features)
+            if placement is None and self.integration.run_all():  # their landmarks may be what is missing
+                self.motion.follow_map()
+                placement = self._track_motion(frame, features)
+            newest = len(self.map.keyframes) - 1
+            placement = placement or self.localiser.from_keyframe(features, newest)
+            T_guess = self.motion.predict(frame.timestamp_s)
+        else:
+            self.relocaliser.schedule.count_frame()
+        placement = placement or self.relocaliser.by_place(features, without=newest)
+        placement = placement or self.relocaliser.by_registration(frame, features, T_guess)
+        if placement is not None:
+            self.placed_by[placement.placed_by] += 1
+            self.map.count_views(placement.expected_ids, placement.found_ids)
+            if placement.placed_by in (PlacedBy.LAST_KEYFRAME, PlacedBy.PLACE):
+                self.motion.forget()  # found by its view alone: the recording may have been cut
+        return placement
+
+    def _track_motion(self, frame: Frame, features: Features) -> Placement | None:
+        recent = self.map.resolve(self.motion.landmark_ids)
+        T_guess = self.motion.predict(frame.timestamp_s)
+        return self.localiser.track(features, T_guess, np.unique(recent[recent >= 0]))
+
+    def _lose(self) -> None:
+        """Forget the motion; where it led to last is tried again for some frames."""
+        if self.motion.is_known:
+            self.relocaliser.schedule.start(self.motion.T_camera_world, self.motion.step)
+        self.motion.forget()
+
+    def _correct_by_pose(
+        self, frame: Frame, raw: Features, features: Features, placement: Placement
+    ) -> tuple[Features, Placement]:
+        """Correct the rolling shutter by the velocity of this very frame, and place the frame by that.
+
+        Where its landmarks contradict that velocity, the recording was cut and the camera did not move there.
+        """
+        corrected = self.shutter.correct_by_pose(raw, self.motion, frame.timestamp_s, placement)
+        if corrected is None:
+            return features, placement
+        refined = self.localiser.reoptimise(corrected, placement)
+        if refined.inliers >= _SAME_MOTION * placement.inliers:
+            return corrected, refined
+        self.motion.forget()
+        return raw, self.localiser.reoptimise(raw, placement)
+
+    def _place_in_grown_map(self, features: Features, placement: Placement) -> Placement:
+        """Place a frame again, once the keyframe that waits longest has created its landmarks."""
+        pose = AnchoredPose.of(placement.T_camera_world, self.map.keyframes[-1])
+        self.integration.run_until_landmarks()
+        self.motion.follow_map()
+        carried = replace(
+            placement,
+            T_camera_world=orthonormalised(pose.T_camera_world),
+            landmark_ids=self.map.resolve(placement.landmark_ids),
+        )
+        with self._watch.timed("tracking"):
+            refined = self.localiser.refine_in_local_map(features, carried)
+        if refined is None:
+            return carried
+        self.map.count_views(refined.expected_ids, refined.found_ids)
+        return refined
+
+    def _add_keyframe(self, frame: Frame, features: Features, measured: Placement) -> Placement:
+        """Make a frame a keyframe; returns its placement in the map, which may have moved."""
+        velocity = self.motion.velocity(frame.timestamp_s, measured.T_camera_world)
+        self.motion.advance(frame.timestamp_s, measured.T_camera_world)
+        keyframe = self.integration.add_keyframe(frame, features, measured, velocity)
+        placement = Placement(keyframe.T_camera_world, keyframe.landmark_ids.copy())
+        self.motion.anchor(placement, keyframe)
+        return placement
+
+    def _compact(self) -> None:
+        """Let the map give away ids of landmarks that are gone, unless an adjustment remembers ids."""
+        ids_now = None if self.integration.is_adjusting else self.map.compact()
+        if ids_now is not None:
+            self.frames.renumber(ids_now)
+            self.motion.renumber(ids_now)
