@@ -8,6 +8,7 @@ adapter to GTSAM (rotation first) lives in ``slamdepth.backend``.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -254,3 +255,35 @@ def umeyama(source: Floats, target: Floats, with_scale: bool) -> tuple[float, Fl
         variance = np.mean(np.sum(ds * ds, axis=1))
         scale = float(np.sum(S * sign) / variance) if variance > 0 else 1.0
     return scale, R, mu_t - scale * R @ mu_s
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """``p_a = scale * R p_b + t``: two frames with metres of their own.
+
+    Attributes:
+        scale: metres of a that one of b is.
+        T_a_b: ``(4, 4)`` rotation, and translation in metres of a.
+    """
+
+    scale: float
+    T_a_b: Floats
+
+    @staticmethod
+    def of_camera(T_a_camera: Floats, T_b_camera: Floats, scale: float) -> Similarity:
+        """From one camera's pose in both frames, ``(4, 4)`` each, and the ratio of their metres."""
+        T_b_camera_in_a = T_b_camera.copy()
+        T_b_camera_in_a[:3, 3] *= scale
+        return Similarity(scale, T_a_camera @ invert(T_b_camera_in_a))
+
+    def camera(self, T_b_camera: Floats) -> Floats:
+        """Poses ``(..., 4, 4)`` of cameras in frame a, given those in frame b."""
+        moved: Floats = T_b_camera.copy()
+        moved[..., :3, 3] *= self.scale
+        return self.T_a_b @ moved
+
+    def inverse(self) -> Similarity:
+        """The similarity from a to b."""
+        T_b_a = invert(self.T_a_b)
+        T_b_a[:3, 3] /= self.scale
+        return Similarity(1.0 / self.scale, T_b_a)

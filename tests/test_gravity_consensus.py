@@ -12,7 +12,7 @@ import numpy as np
 from slamdepth.depth.gravity_consensus import GravityConsensus
 from slamdepth.geometry import so3_exp
 from slamdepth.stopwatch import Stopwatch
-from slamdepth.tracking.workers import DepthWorker
+from slamdepth.tracking.workers import DepthWorker, GravityInMap
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
 from slamdepth.typing import Floats
 
@@ -90,32 +90,51 @@ def frame(index: int) -> Frame:
 
 
 def test_later_frames_are_given_what_earlier_ones_agreed_on() -> None:
-    model = GravityModel()
+    model, known = GravityModel(), GravityInMap(GravityConsensus(), np.eye(3))
     with worker_of(model) as worker:
         for k in range(12):
             one = frame(k)
-            worker.request(one, np.eye(3))
+            worker.request(one, known)
             worker.take(one)
     given = {k: gravity for k, gravity in enumerate(model.given) if gravity is not None}
     assert list(given) == [6, 7, 8, 10, 11]  # six are estimated, then every fifth
     assert all(np.allclose(gravity, GRAVITY_W) for gravity in given.values())
 
 
-def test_gravity_in_the_world_is_known_after_all_requests() -> None:
-    with worker_of(GravityModel()) as worker:
-        assert worker.gravity_w() is None
-        for k in range(6):
-            worker.request(frame(k), np.eye(3))
-        gravity_w = worker.gravity_w()  # waits for the six
+def test_images_of_two_maps_do_not_tell_one_another() -> None:
+    model = GravityModel()
+    maps = [GravityInMap(GravityConsensus(), np.eye(3)) for _ in range(2)]
+    with worker_of(model) as worker:
+        for k in range(12):
+            one = frame(k)
+            worker.request(one, maps[k % 2])
+            worker.take(one)
+    assert all(gravity is None for gravity in model.given)
+    for known in maps:
+        gravity_w = known.consensus.in_world()
+        assert gravity_w is not None
+        np.testing.assert_allclose(gravity_w, GRAVITY_W)
+
+
+def test_a_consensus_follows_a_turned_world_and_takes_over_another() -> None:
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    first, second = GravityConsensus(), GravityConsensus()
+    for consensus in (first, second):
+        for _ in range(3):
+            consensus.add(np.eye(3), GRAVITY_W, 1.0)
+    first.turn(turn)
+    second.turn(turn)
+    first.absorb(second)  # three and three are enough
+    gravity_w = first.in_world()
     assert gravity_w is not None
-    np.testing.assert_allclose(gravity_w, GRAVITY_W)
+    np.testing.assert_allclose(gravity_w, turn @ GRAVITY_W)
 
 
 def test_a_frame_with_its_own_gravity_or_without_a_pose_is_predicted_as_it_is() -> None:
     model = GravityModel()
     measured = replace(frame(0), gravity=np.array([0.0, 0.0, 1.0]))
     with worker_of(model) as worker:
-        worker.request(measured, np.eye(3))
+        worker.request(measured, GravityInMap(GravityConsensus(), np.eye(3)))
         worker.take(measured)
         worker.take(frame(1))
     assert model.given[0] is measured.gravity

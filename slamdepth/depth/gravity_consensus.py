@@ -51,6 +51,15 @@ class GravityConsensus:
         self._estimates_w.append(R_world_camera @ gravity)
         self._confidences.append(confidence)
 
+    def turn(self, R_new_old: Floats) -> None:
+        """Follow a world that was turned by ``(3, 3)``."""
+        self._estimates_w = [R_new_old @ estimate for estimate in self._estimates_w]
+
+    def absorb(self, other: GravityConsensus) -> None:
+        """Take over the estimates of a map in the same world frame."""
+        self._estimates_w += other._estimates_w
+        self._confidences += other._confidences
+
     def in_world(self) -> Floats | None:
         """The unit direction ``(3,)`` in the world that most agree on; None before enough do."""
         if len(self._estimates_w) < _MIN_ESTIMATES:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,6 +16,7 @@ from slamdepth.config import Config
 from slamdepth.geometry import invert, rotation_angle_rad, transform
 from slamdepth.loops.consistency import Drift, RefusedLoops
 from slamdepth.loops.edges import MeasuredLoop, odometry_edges, weakness
+from slamdepth.loops.meeting import Meeting
 from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map import Map, MapKeyframe
 from slamdepth.mapping.map_view import NEAREST_M
@@ -97,6 +99,24 @@ class LoopCloser:
                 log.info("loop closed: keyframe %d sees the place of keyframe %d", keyframe.id, candidate)
                 return LoopClosure(candidate, scales)
         return None
+
+    def join(self, other: LoopCloser, first: int, meetings: Sequence[Meeting]) -> None:
+        """Take over keyframes and loops of a map that this map has absorbed.
+
+        Args:
+            first: number of the other map's first keyframe in this map.
+            meetings: what the two maps were joined by; they are loops from now on.
+        """
+        self.places.absorb(other.places, first)
+        self._refused.clear()
+        self._last = None
+        self.count += other.count
+        self.refused += other.refused
+        self._loops += [loop.renumbered(first) for loop in other._loops]
+        units = self._map.units
+        for meeting in meetings:
+            self._loops.append(MeasuredLoop.of(meeting.edge(_LOOP_SIGMAS), units))
+            self._map.fuse_view(meeting.keyframe, meeting.landmark_ids)
 
     def _is_new(self, keyframe: int, candidate: int) -> bool:
         if self._last is None:

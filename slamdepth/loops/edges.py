@@ -46,6 +46,8 @@ def odometry_edges(map_: MapView, together: Ints, looser: float = 1.0) -> list[E
         factor = np.full(j, np.sqrt(len(partners)))
         if looser > 1.0:
             factor *= looser * weakness(shared)
+        if j in map_.starts:  # no odometry leads there: the loops that joined two maps do
+            factor[j - 1] *= _MAX_WEAKNESS
         for i in sorted(partners):
             rotation, translation, log_scale = (float(sigma * factor[i]) for sigma in STEP_SIGMAS)
             T_i_j = keyframes[i].T_camera_world @ keyframe.T_world_camera
@@ -76,3 +78,7 @@ class MeasuredLoop:
         T_i_j = edge.T_i_j.copy()
         T_i_j[:3, 3] *= scale_i
         return replace(edge, T_i_j=T_i_j, scale_i_j=edge.scale_i_j * scale_i / scale_j)
+
+    def renumbered(self, first: int) -> MeasuredLoop:
+        """The same loop where the numbers of its keyframes grow by ``first``."""
+        return replace(self, edge=replace(self.edge, i=self.edge.i + first, j=self.edge.j + first))

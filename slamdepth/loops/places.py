@@ -94,7 +94,21 @@ class PlaceRecogniser:
         self, keyframe_id: int, *, exclude: Collection[int] = (), top_k: int = 10
     ) -> list[tuple[int, float]]:
         """:meth:`query` with a keyframe that was added; it is never its own answer."""
-        return self._ranked(self._vector(keyframe_id), {keyframe_id, *exclude}, top_k)
+        return self._ranked(self.vector(keyframe_id), {keyframe_id, *exclude}, top_k)
+
+    def query_vector(self, vector: NDArray[np.float32], *, top_k: int = 10) -> list[tuple[int, float]]:
+        """:meth:`query` with a place vector ``(W,)``, as another index of the same vocabulary has it."""
+        return self._ranked(vector, (), top_k)
+
+    def best_score(self, vector: NDArray[np.float32]) -> float:
+        """Similarity of the keyframe that looks most like a place vector ``(W,)``; 0 where none does."""
+        answers = self._ranked(vector, (), 1)
+        return answers[0][1] if answers else 0.0
+
+    def absorb(self, other: PlaceRecogniser, first: int) -> None:
+        """Take over all keyframes of another index; their ids grow by ``first``."""
+        for keyframe_id in other._ids:
+            self.add_vector(first + keyframe_id, other.vector(keyframe_id))
 
     def score(self, first_id: int, second_id: int) -> float:
         """Cosine of the place vectors of two keyframes.
@@ -102,9 +116,14 @@ class PlaceRecogniser:
         A loop candidate should look more alike than the keyframe's own neighbours do, times
         some factor; absolute scores depend on the scene (Gálvez-López and Tardós, eq. 3).
         """
-        return float(np.round(self._vector(first_id) @ self._vector(second_id), 6))
+        return float(np.round(self.vector(first_id) @ self.vector(second_id), 6))
 
-    def _vector(self, keyframe_id: int) -> NDArray[np.float32]:
+    def vector(self, keyframe_id: int) -> NDArray[np.float32]:
+        """The place vector ``(W,)`` of a keyframe that was added.
+
+        Raises:
+            TrackingError: it was not.
+        """
         if keyframe_id not in self._row_of:
             raise TrackingError(f"place recognition: keyframe {keyframe_id} was never added")
         return np.asarray(self._vectors[self._row_of[keyframe_id]])

@@ -150,14 +150,16 @@ class KeyframeStore:
         """Size of the temporary file."""
         return self._file.size
 
-    def tidy(self, keyframes: Sequence[HasImages]) -> None:
+    def tidy(self, keyframes: Sequence[HasImages], budget_bytes: float | None = None) -> None:
         """Spill the oldest of ``keyframes`` until the rest is within the budget.
 
         Args:
             keyframes: all so far, in the same order each time, each with its prediction.
+            budget_bytes: for this time; None takes the store's own.
         """
+        budget = self._budget_bytes if budget_bytes is None else budget_bytes
         self._sizes += [_size(keyframe) for keyframe in keyframes[len(self._sizes) :]]
-        while self.resident_bytes > self._budget_bytes and self._spilled < len(keyframes) - _NEWEST:
+        while self.resident_bytes > budget and self._spilled < len(keyframes) - _NEWEST:
             keyframe = keyframes[self._spilled]
             if keyframe.prediction is not None:
                 keyframe.prediction._spill(self._file, keyframe.frame)
@@ -166,6 +168,8 @@ class KeyframeStore:
 
 
 def _size(keyframe: HasImages) -> int:
+    if keyframe.frame.is_spilled:  # by the map that it was taken over from
+        return 0
     frame = keyframe.frame.load()
     arrays: list[NDArray[Any] | None] = [frame.image_rgb, frame.depth_m]
     if keyframe.prediction is not None:

@@ -77,6 +77,20 @@ class Landmarks:
             getattr(grown, field.name)[: len(kept)] = getattr(self, field.name)[kept]
         return grown
 
+    def joined(self, size: int, other: Landmarks, first_keyframe: int) -> Landmarks:
+        """Copies of the first ``size`` landmarks and of all ``other`` ones behind them.
+
+        Args:
+            first_keyframe: number that the other map's first keyframe has from now on.
+        """
+        count = len(other)
+        grown = self.moved(np.arange(size), size + count)
+        for field in fields(self):
+            getattr(grown, field.name)[size:] = getattr(other, field.name)
+        grown.anchor_keyframe[size:] += first_keyframe
+        grown.alias[size:] += size
+        return grown
+
     def read_only(self, size: int) -> Landmarks:
         """Views of the first ``size`` landmarks that follow every change and cannot be written."""
         views = {field.name: getattr(self, field.name)[:size] for field in fields(self)}

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from slamdepth.geometry import invert, transform
+from slamdepth.geometry import Similarity, invert, transform
 from slamdepth.mapping.keyframe_store import KeyframeStore, StoredFrame, StoredPrediction
 from slamdepth.mapping.landmarks import AdjustedLandmarks
 from slamdepth.mapping.map_keyframe import KeyframeState, MapKeyframe
@@ -307,6 +307,32 @@ class Map(MapView):
             _scale_depths(state, factor)
         self._refresh_views(np.arange(size))
 
+    def move(self, similarity: Similarity) -> None:
+        """Express the whole map in another world frame, and in its metres."""
+        count = len(self.keyframes)
+        self.correct_similarities(similarity.camera(self.T_world_camera), np.full(count, similarity.scale))
+
+    def absorb(self, other: Map) -> tuple[int, int]:
+        """Take over all keyframes and landmarks of a map in the same world frame.
+
+        They follow behind this map's own, whenever they were taken. The other map must not be used any more;
+        its :class:`MapKeyframe` and what is anchored to them belong to this map.
+
+        Returns:
+            The ids that the first keyframe and the first landmark taken over have from now on.
+        """
+        first_keyframe, first_landmark = len(self._states), self.size
+        self._own = self._own.joined(first_landmark, other.landmarks, first_keyframe)
+        self.landmarks = self._own.read_only(len(self._own))
+        self._compact_at = max(self._compact_at, 2 * self.size)
+        for state in other._states:
+            state.id += first_keyframe
+            state.landmark_ids = np.where(state.landmark_ids >= 0, state.landmark_ids + first_landmark, -1)
+        self._states += other._states
+        self.keyframes = (*self.keyframes, *other.keyframes)
+        self.starts |= {first_keyframe + start for start in other.starts}
+        return first_keyframe, first_landmark
+
     def _refresh_views(self, ids: Ints) -> None:
         """Recompute how landmarks are seen from their anchor keyframes."""
         own = self._own
@@ -349,6 +375,10 @@ class Map(MapView):
     def spill_images(self) -> None:
         """Keep the images and depth maps of keyframes within the budget of memory."""
         self._store.tidy(self._states)
+
+    def spill_all_images(self) -> None:
+        """Keep images and depth maps of the newest keyframes only: the camera has left this map."""
+        self._store.tidy(self._states, budget_bytes=0)
 
 
 def _scale_depths(state: KeyframeState, factor: float) -> None:

@@ -23,7 +23,8 @@ class MapView:
 
     Attributes:
         landmarks: arrays of all landmarks, living or not, that cannot be written.
-        keyframes: in order of time; a keyframe's id is its index.
+        keyframes: in order of time, but for those of maps taken over; a keyframe's id is its index.
+        starts: ids of the keyframes that no odometry leads to: the first one of each map in this map.
     """
 
     def __init__(self) -> None:
@@ -31,6 +32,7 @@ class MapView:
         self._own = Landmarks.empty(_INITIAL_CAPACITY)
         self.landmarks: Landmarks = self._own.read_only(0)
         self.keyframes: tuple[MapKeyframe, ...] = ()
+        self.starts: frozenset[int] = frozenset({0})
 
     @property
     def size(self) -> int:

@@ -121,6 +121,11 @@ class Adjuster:
         result = self._side.submit(bundle_adjust, part.problem, _LOCAL_STEPS)
         return Adjustment(part, len(self._map.keyframes), result)
 
+    def adjust_window(self, keyframe: MapKeyframe) -> None:
+        """Local bundle adjustment of a keyframe and those that share most landmarks with it, at once."""
+        if self._config.bundle.local:
+            self.adjust(*self._window(keyframe), _LOCAL_STEPS)
+
     def _window(self, keyframe: MapKeyframe) -> tuple[list[int], list[int], Ints]:
         """Keyframes to move, keyframes that hold them, and the landmarks between."""
         config = self._config.bundle

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -17,12 +17,13 @@ from slamdepth.mapping.map import Map, MapKeyframe
 from slamdepth.mapping.placement import PlacedBy
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.stopwatch import Stopwatch
+from slamdepth.tracking.atlas import Atlas
 from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.integration import KeyframeIntegration
 from slamdepth.tracking.local_mapper import LocalMapper
 from slamdepth.tracking.map_tracker import MapTracker
 from slamdepth.tracking.rolling_shutter import RollingShutter
-from slamdepth.tracking.workers import DepthWorker, in_parallel
+from slamdepth.tracking.workers import in_parallel
 from slamdepth.types import RunStatistics
 
 _SEARCHED_AGAIN = 6  # neighbours of each keyframe; twice as many gain nothing measurable
@@ -45,18 +46,38 @@ class FinalMap:
     scale_votes: tuple[float, ...]
 
 
-def finish_map(
-    tracked: MapTracker, depth: DepthWorker, config: Config, watch: Stopwatch, steps: int
-) -> Reconstruction:
-    """Adjust the whole map, make it metric, and return it with the pose of every frame placed in it.
+def finish_run(atlas: Atlas, config: Config, watch: Stopwatch, steps: int) -> Reconstruction:
+    """Finish all maps of a run that are kept.
 
     Args:
         steps: frames given to the tracker.
+
+    Returns:
+        The largest map, with the others that never met it.
     """
+    atlas.active.integration.run_all()
+    atlas.meet()
+    kept = atlas.by_size()
+    atlas.active = kept[0]
+    *others, largest = (_finish_map(tracked, config, watch, steps) for tracked in reversed(kept))
+    notes = list(largest.notes)
+    if others:
+        notes.insert(0, f"the camera was lost, and found in places that never met: {len(kept)} separate maps")
+    if atlas.dropped_frames:
+        notes.append(f"{atlas.dropped_frames} frames lie in maps too small to be of use, and have no pose")
+    return replace(
+        largest,
+        notes=tuple(notes),
+        statistics=replace(largest.statistics, maps_joined=atlas.joined),
+        others=tuple(reversed(others)),
+    )
+
+
+def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: int) -> Reconstruction:
+    """Adjust the whole map, make it metric, and return it with the pose of every frame placed in it."""
     integration, map_, frames, shutter = (
         tracked.integration, tracked.map, tracked.frames, tracked.shutter,
     )  # fmt: skip
-    integration.run_all()
     with watch.timed("final"):
         final = optimise_map(map_, integration, frames, shutter, config)
     statistics = RunStatistics(
@@ -72,16 +93,17 @@ def finish_map(
         readout_sigma_s=shutter.sigma_s,
         scale_votes=final.scale_votes,
     )
+    in_time = sorted(map_.keyframes, key=lambda keyframe: keyframe.frame.timestamp_s)
     # NumPy and the disk work in other threads while this one refines frames
-    with in_parallel(partial(_final, mapper=integration.mapper), map_.keyframes) as making:
+    with in_parallel(partial(_final, mapper=integration.mapper), in_time) as making:
         if config.bundle.final:
             frames.refine(shutter.readout_s)
-        keyframes = tuple(made.result() for made in making)
+        keyframes = tuple(replace(made.result(), id=n) for n, made in enumerate(making))
     return Reconstruction(
         trajectory=frames.trajectory(),
         keyframes=keyframes,
         points_m=map_.landmarks.position_w[map_.seen_by(2)],
-        gravity_w=depth.gravity_w(),
+        gravity_w=integration.gravity.in_world(),
         notes=final.notes,
         statistics=statistics,
     )

@@ -126,6 +126,18 @@ class FrameLog:
             self._prune()
             self._prune_at = 2 * len(self._placed)
 
+    def absorb(self, other: FrameLog, first_landmark: int) -> None:
+        """Take over the frames of a map that this map has absorbed.
+
+        Args:
+            first_landmark: id that the other map's first landmark has in this map.
+        """
+        other._ids_now = np.concatenate([other._ids_now, np.arange(other._map.size)]).astype(np.int32)
+        other._prune()
+        for placed in other._placed:
+            placed.landmark_ids = placed.landmark_ids + np.int32(first_landmark + len(self._ids_now))
+        self._placed = sorted(self._placed + other._placed, key=lambda placed: placed.timestamp_s)
+
     def _prune(self) -> None:
         """Forget what was seen of landmarks that are gone."""
         for placed in self._placed:

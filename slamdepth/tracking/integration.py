@@ -12,7 +12,7 @@ Each stage runs between two frames, so that none of them delays a frame for long
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 
@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 
 from slamdepth.backend.bundle_problem import BundleResult
 from slamdepth.config import Config
+from slamdepth.depth.gravity_consensus import GravityConsensus
 from slamdepth.frontend.features import Features
 from slamdepth.loops.closer import LoopCloser
+from slamdepth.loops.meeting import Meeting
 from slamdepth.mapping.map import Map, MapKeyframe
 from slamdepth.mapping.placement import Placement
 from slamdepth.stopwatch import Stopwatch
@@ -32,7 +34,7 @@ from slamdepth.tracking.keyframe_policy import KeyframePolicy
 from slamdepth.tracking.local_mapper import LocalMapper
 from slamdepth.tracking.localiser import Localiser
 from slamdepth.tracking.rolling_shutter import RollingShutter
-from slamdepth.tracking.workers import Workers
+from slamdepth.tracking.workers import GravityInMap, Workers
 from slamdepth.types import Camera, Frame
 from slamdepth.typing import Floats
 
@@ -55,6 +57,7 @@ class KeyframeIntegration:
 
     Attributes:
         mapper, adjuster, loops: the parts of the work, which finishing the map uses again.
+        gravity: what the images of this map say of gravity; read it when no keyframe waits.
     """
 
     def __init__(
@@ -79,6 +82,8 @@ class KeyframeIntegration:
         self.loops = LoopCloser(config, map_, localiser)
         self._policy = KeyframePolicy(config, map_)
         self._waiting: list[_Waiting] = []  # oldest first
+        self.gravity = GravityConsensus()
+        self._complete: list[MapKeyframe] = []
         self._is_adjusting = False
         self._readout: Future[BundleResult] | None = None
 
@@ -116,7 +121,7 @@ class KeyframeIntegration:
             velocity: ``(6,)`` m/s and rad/s, camera frame.
         """
         depth = self._workers.depth
-        depth.request(frame, placement.T_camera_world[:3, :3].T)
+        depth.request(frame, GravityInMap(self.gravity, placement.T_camera_world[:3, :3].T))
         with self._timed("mapping"):
             keyframe = self._map.add_keyframe(
                 frame, features, placement.T_camera_world, placement.landmark_ids, velocity
@@ -154,6 +159,7 @@ class KeyframeIntegration:
         with self._timed("mapping"):
             self._map.cull(keyframe)
             self._map.spill_images()
+        self._complete.append(keyframe)
 
     def _search_and_adjust(self, keyframe: MapKeyframe, neighbours: list[int]) -> Iterator[None]:
         """Search the keyframe's landmarks in ``neighbours`` and adjust the window in the side thread."""
@@ -195,6 +201,29 @@ class KeyframeIntegration:
         is_complete = next(self._waiting[0].stages, _COMPLETE) is _COMPLETE
         if is_complete:
             del self._waiting[0]
+
+    def take_complete(self) -> list[MapKeyframe]:
+        """The keyframes whose integration was completed since this was asked last, oldest first."""
+        complete, self._complete = self._complete, []
+        return complete
+
+    def join(self, other: KeyframeIntegration, first: int, meetings: Sequence[Meeting]) -> None:
+        """Go on in the place of the integration of a map that this map has absorbed; no keyframe waits.
+
+        Args:
+            first: number of the other map's first keyframe in this map.
+            meetings: what the two maps were joined by.
+        """
+        self.gravity.absorb(other.gravity)
+        self.mapper.dropped += other.mapper.dropped
+        self.loops.join(other.loops, first, meetings)
+        self._policy.keyframe_made()
+        with self._timed("mapping"):
+            for meeting in meetings:
+                self.mapper.search(meeting.keyframe, self.mapper.neighbours(meeting.keyframe))
+        with self._timed("bundle"):
+            for meeting in meetings:
+                self.adjuster.adjust_window(meeting.keyframe)
 
     def _update_velocity(self, keyframe: MapKeyframe) -> None:
         """The frames after a keyframe say how it moved, too."""

@@ -4,15 +4,18 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features, ScaleLevels
-from slamdepth.geometry import orthonormalised
+from slamdepth.geometry import Similarity, orthonormalised
+from slamdepth.loops.meeting import Meeting
+from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map import Map
-from slamdepth.mapping.map_keyframe import AnchoredPose
+from slamdepth.mapping.map_keyframe import AnchoredPose, MapKeyframe
 from slamdepth.mapping.placement import PlacedBy, Placement
 from slamdepth.stopwatch import Stopwatch
 from slamdepth.tracking.frame_log import FrameLog
@@ -46,17 +49,26 @@ class MapTracker:
     """Tracks the camera in one map, and grows the map.
 
     Args:
+        id_: number of the map in its run.
         levels: pyramid levels of the extractor.
         workers, watch: shared by the maps of a run.
 
     Attributes:
+        id: number of the map, from 0 in the order of their start.
         map, frames, motion, shutter, localiser, integration, relocaliser: the parts, of this map alone.
         placed_by: how many frames were placed by what.
     """
 
     def __init__(
-        self, camera: Camera, config: Config, levels: ScaleLevels, workers: Workers, watch: Stopwatch
+        self,
+        id_: int,
+        camera: Camera,
+        config: Config,
+        levels: ScaleLevels,
+        workers: Workers,
+        watch: Stopwatch,
     ) -> None:
+        self.id = id_
         self._config = config
         self._workers = workers
         self._watch = watch
@@ -114,6 +126,53 @@ class MapTracker:
             placed_by = placement.placed_by
             features, placement = self._correct_by_pose(frame, raw, features, placement)
         return self._add(frame, raw, features, placement, placed_by)
+
+    def find(self, frame: Frame, raw: Features) -> Placed | None:
+        """Place a frame by what it looks like, in a map that the camera was not in."""
+        with self._watch.timed("tracking"):
+            placement = self.relocaliser.by_place(raw)
+        if placement is None:
+            return None
+        self.placed_by[placement.placed_by] += 1
+        self.map.count_views(placement.expected_ids, placement.found_ids)
+        return self._add(frame, raw, raw, placement, placement.placed_by)
+
+    def leave(self) -> None:
+        """The camera is in another map from now on."""
+        self.integration.run_all()
+        self.motion.forget()
+        self.map.spill_all_images()
+
+    @property
+    def places(self) -> PlaceRecogniser:
+        """Index of the map's keyframes by what they look like."""
+        return self.integration.loops.places
+
+    def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
+        """Place a keyframe of any map by matching it with the keyframe ``candidate`` of this map."""
+        return self.localiser.from_keyframe(keyframe.features, candidate, is_lost=True)
+
+    def move(self, similarity: Similarity) -> None:
+        """Express everything in another world frame, and in its metres; no keyframe waits."""
+        self.map.move(similarity)
+        self.motion.rescale(similarity.scale)
+        self.integration.gravity.turn(similarity.T_a_b[:3, :3])
+
+    def absorb(self, other: MapTracker, meetings: Sequence[Meeting]) -> None:
+        """Go on in the place of another map in the same world frame, which must not be used any more.
+
+        Args:
+            meetings: what the two maps were joined by.
+        """
+        first_keyframe, first_landmark = self.map.absorb(other.map)
+        self.frames.absorb(other.frames, first_landmark)
+        self.motion = other.motion
+        ids = self.motion.landmark_ids
+        self.motion.landmark_ids = np.where(ids >= 0, ids + first_landmark, -1)
+        self.placed_by += other.placed_by
+        self.shutter.adopt(other.shutter)
+        self.integration.join(other.integration, first_keyframe, meetings)
+        self.motion.follow_map()
 
     def _add(
         self, frame: Frame, raw: Features, features: Features, placement: Placement, placed_by: PlacedBy

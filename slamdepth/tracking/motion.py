@@ -78,6 +78,11 @@ class MotionModel:
         self._last = AnchoredPose.of(placement.T_camera_world, keyframe)
         self.landmark_ids = placement.landmark_ids
 
+    def rescale(self, factor: float) -> None:
+        """Follow a map whose metres were multiplied by ``factor``."""
+        self.step[:3, 3] *= factor
+        self.follow_map()
+
     def forget(self) -> None:
         """The camera is lost, or the recording was cut: no motion leads from the last frame to the next."""
         self._last = None

@@ -121,6 +121,14 @@ class RollingShutter:
             for keyframe in self._map.keyframes:
                 self.correct_keyframe(keyframe)
 
+    def adopt(self, other: RollingShutter) -> None:
+        """Take over what is known of the same camera from another map; keyframes follow."""
+        if other.sigma_s is None or other.readout_s == self.readout_s:
+            return
+        self.readout_s, self.sigma_s = other.readout_s, other.sigma_s
+        for keyframe in self._map.keyframes:
+            self.correct_keyframe(keyframe)
+
     def px_rate(self, keyframe: MapKeyframe, at: Ints) -> Floats:
         """Pixels ``(M, 2)`` by which a second of readout time moves features ``at (M,)`` of a keyframe."""
         inverse = self.inverse_depth(keyframe.T_camera_world, keyframe.landmark_ids)[at]

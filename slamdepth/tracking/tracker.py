@@ -18,7 +18,8 @@ from slamdepth.mapping.placement import PlacedBy
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.stopwatch import Stopwatch
 from slamdepth.thread_limits import single_threaded
-from slamdepth.tracking.finish import finish_map
+from slamdepth.tracking.atlas import Atlas
+from slamdepth.tracking.finish import finish_run
 from slamdepth.tracking.frame_log import check_frame
 from slamdepth.tracking.map_tracker import MapTracker, Placed
 from slamdepth.tracking.workers import DepthWorker, Workers
@@ -61,11 +62,18 @@ class Tracker:
         self._prepare = Preparation(camera, config.features)
         self._watch = Stopwatch()
         self._workers = Workers(DepthWorker(model, self._watch, with_uncertainty=config.depth.uncertainty))
-        self._active = MapTracker(camera, config, self._prepare.levels, self._workers, self._watch)
+        self._atlas = Atlas(self._new_map, config)
         self._steps = 0
         self._last_time_s = -np.inf
         self._finished = False
         _load_libraries()
+
+    def _new_map(self, id_: int) -> MapTracker:
+        return MapTracker(id_, self.camera, self.config, self._prepare.levels, self._workers, self._watch)
+
+    @property
+    def _active(self) -> MapTracker:
+        return self._atlas.active
 
     def prepare(self, frame: Frame) -> Prepared:
         """The features of a frame, which another thread may find ahead of :meth:`step`."""
@@ -92,21 +100,15 @@ class Tracker:
         with single_threaded():
             raw = self._features(frame, prepared)
             self._workers.between.wait()
-            result = self._place(frame, raw)
+            placed = self._atlas.track(frame, raw)
+            result = self._result(frame, placed)
         self._last_time_s = self._active.motion.last_time_s = frame.timestamp_s
         self._watch.next_frame()
         if self._active.map.keyframes:
             self._active.integration.count_frame()
             if self._active.integration.is_due:
-                self._workers.between.begin(self._active.run_stage)
+                self._workers.between.begin(self._atlas.run_stage)
         return result
-
-    def _place(self, frame: Frame, raw: Features) -> StepResult:
-        """Place a frame in the map, or start the map with it."""
-        if not self._active.map.keyframes:
-            placed = self._active.start(frame, raw)
-            return self._result(frame, TrackingStatus.INITIALISING, placed)
-        return self._result(frame, TrackingStatus.LOST, self._active.track(frame, raw))
 
     def _features(self, frame: Frame, prepared: Prepared | None) -> Features:
         prepared = prepared or self._prepare(frame)
@@ -114,22 +116,27 @@ class Tracker:
         self._steps += 1
         return prepared.features
 
-    def _result(self, frame: Frame, otherwise: TrackingStatus, placed: Placed | None) -> StepResult:
-        """What a step says; its status is ``otherwise`` where the frame was not placed."""
+    def _result(self, frame: Frame, placed: Placed | None) -> StepResult:
+        maps = self._atlas.maps
+        missing = TrackingStatus.LOST if self._active.map.keyframes else TrackingStatus.INITIALISING
         return StepResult(
             index=frame.index,
             timestamp_s=frame.timestamp_s,
-            status=otherwise if placed is None else _STATUS[placed.placed_by],
+            status=missing if placed is None else _STATUS[placed.placed_by],
             T_world_camera=None if placed is None else invert(placed.placement.T_camera_world),
             inliers=0 if placed is None else placed.placement.inliers,
             is_keyframe=placed is not None and placed.is_keyframe,
-            keyframes=len(self._active.map.keyframes),
-            loop_closures=self._active.integration.loops.count,
+            keyframes=sum(len(map_.map.keyframes) for map_ in maps),
+            loop_closures=sum(map_.integration.loops.count for map_ in maps),
             timings_ms=self._watch.frame_ms,
+            map_id=self._active.id,
         )
 
     def finish(self) -> Reconstruction:
-        """Adjust the whole map, make it metric, and return it with the pose of every placed frame.
+        """Adjust each map, make it metric, and return the largest one with the pose of every frame in it.
+
+        Returns:
+            The map that most frames were placed in. Those that never met it are its ``others``.
 
         Raises:
             TrackingError: it was called before, or no frame could be placed.
@@ -142,7 +149,7 @@ class Tracker:
         self._finished = True
         self._watch.next_frame()
         with self, single_threaded():
-            return finish_map(self._active, self._workers.depth, self.config, self._watch, self._steps)
+            return finish_run(self._atlas, self.config, self._watch, self._steps)
 
     def close(self) -> None:
         """End the tracker's threads; :meth:`finish` does so too."""

@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ParamSpec, TypeVar
 
@@ -80,11 +80,19 @@ class BetweenFrames(Worker):
             log.error("the work between two frames failed: %s", error)
 
 
+@dataclass(frozen=True)
+class GravityInMap:
+    """What is known of gravity in a map, and how a camera ``R_world_camera (3, 3)`` is turned in it."""
+
+    consensus: GravityConsensus
+    R_world_camera: Floats
+
+
 class DepthWorker:
     """Predicts the depth of keyframes, one after the other, in a thread that computes on one core.
 
-    A sensor's depth is there already and is passed on at once. What one image says of gravity helps to
-    predict the next.
+    A sensor's depth is there already and is passed on at once. What one image of a map says of gravity helps
+    to predict the next.
 
     Args:
         with_uncertainty: False drops what a network says of its errors.
@@ -96,7 +104,6 @@ class DepthWorker:
         self._is_sensor = is_sensor(model)
         self._watch = watch
         self._with_uncertainty = with_uncertainty
-        self._gravity = GravityConsensus()
         self._pool = ThreadPoolExecutor(1, "slamdepth-depth", initializer=one_thread_here)
         self._requested: list[tuple[Frame, Future[DepthPrediction]]] = []
         self._last: tuple[Frame, DepthPrediction] | None = None
@@ -112,23 +119,23 @@ class DepthWorker:
     def _is_last(self, frame: Frame) -> bool:
         return self._last is not None and self._last[0] is frame
 
-    def request(self, frame: Frame, R_world_camera: Floats | None = None) -> None:
+    def request(self, frame: Frame, gravity: GravityInMap | None = None) -> None:
         """Start the prediction for ``frame``, unless it was requested before.
 
         Args:
-            R_world_camera: ``(3, 3)`` where it is known, to pass gravity from image to image.
+            gravity: passes the direction of gravity from image to image; None where the pose is not known.
         """
         if not self._is_last(frame) and all(requested is not frame for requested, _ in self._requested):
-            self._requested.append((frame, self._pool.submit(self._predict, frame, R_world_camera)))
+            self._requested.append((frame, self._pool.submit(self._predict, frame, gravity)))
 
-    def _predict(self, frame: Frame, R_world_camera: Floats | None) -> DepthPrediction:
-        if R_world_camera is None or frame.gravity is not None:
+    def _predict(self, frame: Frame, gravity: GravityInMap | None) -> DepthPrediction:
+        if gravity is None or frame.gravity is not None:
             prediction = self._model.predict(frame)
         else:
-            known = self._gravity.in_camera(R_world_camera)
+            known = gravity.consensus.in_camera(gravity.R_world_camera)
             prediction = self._model.predict(replace(frame, gravity=known))
             if known is None and prediction.gravity is not None:
-                self._gravity.add(R_world_camera, prediction.gravity, prediction.gravity_share)
+                gravity.consensus.add(gravity.R_world_camera, prediction.gravity, prediction.gravity_share)
         if self._with_uncertainty or prediction.is_sensor:
             return prediction
         return replace(prediction, sigma_log=None)
@@ -142,10 +149,6 @@ class DepthWorker:
                 self._last = (frame, self._requested[n][1].result())
                 del self._requested[n]
             return self._last[1]
-
-    def gravity_w(self) -> Floats | None:
-        """Unit direction of gravity ``(3,)`` in the world, after all requests; None where it is not known."""
-        return self._pool.submit(self._gravity.in_world).result()
 
     def close(self) -> None:
         """End the thread; predictions that have not started are dropped."""

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where two maps of one run show the same place, and the similarity between them that this gives.
+
+After ORB-SLAM3 (Campos et al., "ORB-SLAM3: An Accurate Open-Source Library for Visual, Visual-Inertial and
+Multi-Map SLAM", 2021, section VI): a place is recognised by several keyframes, not by one. Two maps that are
+joined wrongly cannot be told apart again, so keyframes must agree on the whole similarity, scale included.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from slamdepth.backend.pose_graph import Edge
+from slamdepth.geometry import Similarity, invert, rotation_angle_rad, transform
+from slamdepth.loops.places import PlaceRecogniser
+from slamdepth.mapping.map_keyframe import AnchoredPose, MapKeyframe
+from slamdepth.mapping.map_view import NEAREST_M, MapView
+from slamdepth.mapping.placement import Placement
+from slamdepth.typing import Floats, Floats32, Ints
+
+_CANDIDATES = 2
+_MIN_SCORE_SHARE = 0.6  # of the similarity of two neighbours in time
+_FEWEST_DEPTHS = 10  # features with a landmark in both maps, which give the scale between them
+_AGREEING = 3  # keyframes that must say the same
+_REMEMBERED = 12  # keyframes a meeting is kept for
+_MAX_TURN_RAD = 0.1
+_MAX_SHIFT = 0.1  # of the distance of what the keyframe sees
+_MAX_LOG_SCALE = 0.2  # between meetings; a network's scale differs by as much from image to image
+_MAX_LOG_SCALE_MEASURED = 0.05  # of the similarity itself, where a sensor made both maps
+_MAX_LOG_SCALE_PREDICTED = 1.1  # a network errs by a factor of three hardly ever
+
+
+class Place(Protocol):
+    """Another map, as far as a keyframe can be looked for in it."""
+
+    @property
+    def map(self) -> MapView: ...
+
+    @property
+    def places(self) -> PlaceRecogniser: ...
+
+    def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
+        """Place a keyframe of any map by matching it with the keyframe ``candidate`` of this map."""
+        ...
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """A keyframe that sees a place of another map.
+
+    Attributes:
+        keyframe: of the map that the camera is in.
+        unit: of the keyframe at that time, see :class:`MapKeyframe`.
+        pose: where it is in the other map, relative to the keyframe whose place it sees.
+        landmark_ids: ``(N,)`` landmark of the other map that each feature sees, -1 for none.
+        scale: metres of the other map that one of the keyframe's was at that time.
+        distance_m: median distance of what was seen, in metres of the other map at that time.
+    """
+
+    keyframe: MapKeyframe
+    unit: float
+    pose: AnchoredPose
+    landmark_ids: Ints
+    scale: float
+    distance_m: float
+
+    @property
+    def inliers(self) -> int:
+        """Number of landmarks of the other map that agree."""
+        return int(np.count_nonzero(self.landmark_ids >= 0))
+
+    @property
+    def _growth(self) -> float:
+        """What a metre of the other map was multiplied by since."""
+        return self.pose.keyframe.unit / self.pose.unit
+
+    @property
+    def similarity(self) -> Similarity:
+        """From the keyframe's map to the other one, as both are now."""
+        scale = self.scale * self._growth * self.unit / self.keyframe.unit
+        T_other_camera = invert(self.pose.T_camera_world)
+        return Similarity.of_camera(T_other_camera, self.keyframe.T_world_camera, scale)
+
+    def edge(self, sigmas: tuple[float, float, float]) -> Edge:
+        """The meeting as a loop, once the maps are one."""
+        i, j = self.pose.keyframe, self.keyframe
+        T_i_j = i.T_camera_world @ invert(self.pose.T_camera_world)
+        return Edge(i.id, j.id, T_i_j, self.similarity.scale, sigmas, is_loop=True)
+
+    def agrees(self, other: Meeting) -> bool:
+        """Whether another meeting says the same of this keyframe's pose and of the scale."""
+        mine, said = self.similarity, other.similarity
+        D = self.pose.T_camera_world @ said.camera(self.keyframe.T_world_camera)
+        return (
+            float(rotation_angle_rad(D[:3, :3])) < _MAX_TURN_RAD
+            and float(np.linalg.norm(D[:3, 3])) < _MAX_SHIFT * self.distance_m * self._growth
+            and abs(np.log(mine.scale / said.scale)) < _MAX_LOG_SCALE
+        )
+
+
+def find_meeting(
+    keyframe: MapKeyframe, home: MapView, words: Floats32, least_score: float, other: Place, min_inliers: int
+) -> Meeting | None:
+    """Look for a keyframe in another map.
+
+    Args:
+        home: the keyframe's map.
+        words: place vector ``(W,)`` of the keyframe.
+        least_score: similarity of places below which nothing is tried.
+        min_inliers: landmarks that must agree.
+    """
+    for candidate, score in other.places.query_vector(words, top_k=_CANDIDATES):
+        if score < _MIN_SCORE_SHARE * least_score:
+            return None
+        placement = other.place_keyframe(keyframe, candidate)
+        if placement is None or placement.inliers < min_inliers:
+            continue
+        meeting = _meeting(keyframe, home, other.map, candidate, placement)
+        if meeting is not None:
+            return meeting
+    return None
+
+
+def _meeting(
+    keyframe: MapKeyframe, home: MapView, there: MapView, candidate: int, placement: Placement
+) -> Meeting | None:
+    """The meeting with its scale; None where too little tells the scale, or no such scale can be."""
+    at = np.flatnonzero((placement.landmark_ids >= 0) & (keyframe.landmark_ids >= 0))
+    z_there = _depths(there, placement.T_camera_world, placement.landmark_ids[at])
+    z_home = _depths(home, keyframe.T_camera_world, keyframe.landmark_ids[at])
+    ok = (z_there > NEAREST_M) & (z_home > NEAREST_M)
+    if np.count_nonzero(ok) < _FEWEST_DEPTHS:
+        return None
+    log_scale = float(np.median(np.log(z_there[ok] / z_home[ok])))
+    is_measured = there.is_measured and home.is_measured
+    if abs(log_scale) > (_MAX_LOG_SCALE_MEASURED if is_measured else _MAX_LOG_SCALE_PREDICTED):
+        return None
+    scale = 1.0 if is_measured else float(np.exp(log_scale))
+    pose = AnchoredPose.of(placement.T_camera_world, there.keyframes[candidate])
+    distance_m = float(np.median(z_there[ok]))
+    return Meeting(keyframe, keyframe.unit, pose, placement.landmark_ids, scale, distance_m)
+
+
+def _depths(map_: MapView, T_camera_world: Floats, ids: Ints) -> Floats:
+    depths: Floats = transform(T_camera_world, map_.landmarks.position_w[ids])[:, 2]
+    return depths
+
+
+class Meetings:
+    """What the latest keyframes of the map in use have seen of one other map."""
+
+    def __init__(self) -> None:
+        self._found: list[Meeting] = []
+
+    def add(self, meeting: Meeting) -> list[Meeting]:
+        """Remember a meeting.
+
+        Returns:
+            Those that agree with it, itself last; empty as long as they are too few.
+        """
+        newest = meeting.keyframe.id
+        self._found = [m for m in self._found if m.keyframe.id > newest - _REMEMBERED]
+        agreeing = [m for m in self._found if m.agrees(meeting) and meeting.agrees(m)]
+        self._found.append(meeting)
+        return [*agreeing, meeting] if len(agreeing) + 1 >= _AGREEING else []
