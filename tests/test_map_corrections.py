@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from growing_map import add_keyframe, check, flat_depth, ids_of, see
+from growing_map import add_keyframe, check, create, flat_depth, ids_of, see
 
 from slamdepth.backend.pose_graph import Edge
-from slamdepth.geometry import invert, se3_exp, transform
+from slamdepth.geometry import Similarity, invert, se3_exp, transform
 from slamdepth.loops.edges import MeasuredLoop
 from slamdepth.mapping.map import AdjustedLandmarks, Map
 from slamdepth.mapping.map_keyframe import AnchoredPose
@@ -207,3 +207,61 @@ def test_a_loop_that_was_applied_asks_for_no_further_correction() -> None:
     assert now.scale_i_j == pytest.approx(1.0)
     first, second = map_.keyframes
     np.testing.assert_allclose(first.T_camera_world @ second.T_world_camera, now.T_i_j, atol=1e-15)
+
+
+SIMILARITY = Similarity(2.0, pose(3.0, 0.0, 1.0, QUARTER))
+
+
+def test_a_similarity_moves_cameras_and_is_undone_by_its_inverse() -> None:
+    T_b_camera = pose(0.5, -1.0, 2.0)
+    T_a_camera = SIMILARITY.camera(T_b_camera)
+    np.testing.assert_allclose(T_a_camera[:3, 3], 2.0 * QUARTER @ [0.5, -1.0, 2.0] + [3.0, 0.0, 1.0])
+    np.testing.assert_allclose(T_a_camera[:3, :3], QUARTER)
+    np.testing.assert_allclose(SIMILARITY.inverse().camera(T_a_camera), T_b_camera, atol=1e-15)
+    again = Similarity.of_camera(T_a_camera, T_b_camera, 2.0)
+    np.testing.assert_allclose(again.T_a_b, SIMILARITY.T_a_b, atol=1e-15)
+
+
+def test_a_moved_map_looks_the_same_from_its_cameras() -> None:
+    map_, moved = small_map(), small_map()
+    moved.move(SIMILARITY)
+    for before, after in zip(map_.keyframes, moved.keyframes, strict=True):
+        np.testing.assert_allclose(
+            transform(after.T_camera_world, moved.landmarks.position_w),
+            2.0 * transform(before.T_camera_world, map_.landmarks.position_w),
+            atol=1e-12,
+        )
+    np.testing.assert_array_equal(moved.units, 2.0)
+    check(moved)
+
+
+def test_an_absorbed_map_goes_on_behind_the_other() -> None:
+    map_, other = small_map(), small_map()
+    other.move(Similarity(1.0, pose(10.0, 0.0, 0.0)))
+    last = other.keyframes[1]
+    anchored = AnchoredPose.of(invert(pose(11.0, 0.0, 0.5)), last)
+    seen_before = [k.landmark_ids.copy() for k in other.keyframes]
+    positions = other.landmarks.position_w.copy()
+    assert map_.absorb(other) == (2, 4)
+    assert [keyframe.id for keyframe in map_.keyframes] == [0, 1, 2, 3]
+    assert map_.starts == {0, 2}
+    assert map_.keyframes[3] is last
+    for keyframe, before in zip(map_.keyframes[2:], seen_before, strict=True):
+        np.testing.assert_array_equal(keyframe.landmark_ids, np.where(before >= 0, before + 4, -1))
+    np.testing.assert_array_equal(map_.landmarks.position_w[4:], positions)
+    np.testing.assert_array_equal(map_.landmarks.anchor_keyframe[4:], [2, 2, 3, 3])
+    np.testing.assert_allclose(anchored.T_camera_world, invert(pose(11.0, 0.0, 0.5)), atol=1e-12)
+    map_.fuse(ids_of(7), ids_of(1))  # what both maps had becomes one landmark
+    assert map_.resolve(ids_of(7)) == 1
+    check(map_)
+    create(map_, map_.keyframes[3], [])
+    add_keyframe(map_, 3)
+    assert map_.keyframes[4].id == 4
+
+
+def test_a_fused_landmark_of_an_absorbed_map_is_still_found() -> None:
+    map_, other = small_map(), small_map()
+    other.fuse(ids_of(3), ids_of(0))
+    map_.absorb(other)
+    np.testing.assert_array_equal(map_.resolve(ids_of(3, 7)), [3, 4])
+    check(map_)

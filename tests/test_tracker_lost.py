@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tracking_scene import (
+    CONFIG,
     COUNT,
     ConstantDepth,
     Run,
@@ -20,12 +21,14 @@ from tracking_scene import (
     played,
 )
 
+from slamdepth.config import Config, merge
 from slamdepth.geometry import se3_exp
 from slamdepth.tracking.relocaliser import RegistrationSchedule
 from slamdepth.types import DepthPrediction, Frame, StepResult, TrackingStatus
 
 LOST, REGISTERED = TrackingStatus.LOST, TrackingStatus.REGISTERED
 BLANK = 60  # two seconds
+SINGLE_MAP = Config.from_dict(merge(CONFIG.model_dump(), {"tracking": {"new_maps": False}}))
 
 
 def black(frame: Frame) -> Frame:
@@ -123,7 +126,7 @@ def test_a_network_does_not_predict_every_lost_frame() -> None:
         for f in frames([30] * 48, colour_only)
     ]
     model = Confused()
-    run = Run(played([*frames(range(8), colour_only), *strange]), model)
+    run = Run(played([*frames(range(8), colour_only), *strange]), model, SINGLE_MAP)
     assert run.statuses()[LOST] == 48
     keyframes = sum(r.is_keyframe for r in run.results)
     assert model.calls == keyframes + 1 + 7  # when it was lost, and at every sixth frame since
@@ -132,6 +135,12 @@ def test_a_network_does_not_predict_every_lost_frame() -> None:
     run = Run(played([*frames(range(8), colour_only), *[black(f) for f in frames([30] * 48)]]), model)
     assert run.statuses()[LOST] == 48
     assert model.calls == keyframes  # black frames are not worth a prediction
+
+    model = Confused()
+    run = Run(played([*frames(range(8), colour_only), *strange]), model)
+    maps = len({r.map_id for r in run.results})
+    assert 3 <= maps <= 7  # each waits twice as long for the next as the one before
+    assert model.calls <= 2 * maps + 8
 
 
 class Fitting(ConstantDepth):
