@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from growing_map import add_keyframe
+from growing_map import add_keyframe, flat_depth
 
-from slamdepth.geometry import Similarity, invert, se3_exp
-from slamdepth.loops.meeting import Meeting, Meetings
+from slamdepth.geometry import Similarity, invert, se3_exp, transform
+from slamdepth.loops.meeting import Meeting, Meetings, find_meeting
+from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map import Map
-from slamdepth.mapping.map_keyframe import AnchoredPose
+from slamdepth.mapping.map_keyframe import AnchoredPose, MapKeyframe
+from slamdepth.mapping.placement import Placement
 from slamdepth.typing import Floats
 
 OTHER_HOME = Similarity(1.4, se3_exp(np.array([0.3, -1.0, 2.0, 0.2, -0.4, 0.1])))
@@ -92,3 +94,71 @@ def test_keyframes_that_contradict_one_another_are_not(error: Floats, scale: flo
     assert [meetings.add(m) for m in seen] == [[], [], []]
     honest = [meeting(home, other, n) for n in (4, 5)]
     assert [len(meetings.add(m)) for m in honest] == [0, 3]  # with the first, which was right
+
+
+class Fits:
+    """A map whose keyframes all look alike."""
+
+    def __init__(self, map_: Map) -> None:
+        self.map = map_
+        self.places = PlaceRecogniser()
+        for keyframe in map_.keyframes:
+            self.places.add(keyframe.id, np.full((40, 32), 7, np.uint8))
+
+    def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
+        raise NotImplementedError
+
+
+def maps_with_landmarks() -> tuple[Map, Map]:
+    """:func:`two_maps`, each keyframe with twelve landmarks of its own, two to four metres away."""
+    rng = np.random.default_rng(1)
+    points_c = np.column_stack([rng.uniform(-1, 1, (12, 2)), rng.uniform(2, 4, 12)])
+    home, other = Map(), Map()
+    for n in range(6):
+        T_home_camera = se3_exp(np.array([0.2 * n, 0.0, 0.0, 0.0, 0.03 * n, 0.0]))
+        for map_, T_world_camera, scale in (
+            (home, T_home_camera, 1.0),
+            (other, OTHER_HOME.camera(T_home_camera), 1.4),
+        ):
+            keyframe = add_keyframe(map_, 12, invert(T_world_camera))
+            position_w = transform(T_world_camera, scale * points_c)
+            map_.create_landmarks(keyframe, np.arange(12), position_w, np.tile(1e-4 * np.eye(3), (12, 1, 1)))
+            map_.set_depth(keyframe, flat_depth(), np.zeros(12), np.ones(12))
+    return home, other
+
+
+def sees_own(map_: Map, n: int) -> Placement:
+    return Placement(map_.keyframes[n].T_camera_world, map_.keyframes[n].landmark_ids)
+
+
+@pytest.mark.parametrize("alike", ["nowhere", "in the other map", "at home", "the place itself"])
+def test_a_place_counts_only_where_nothing_looks_like_it(alike: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    home, other = maps_with_landmarks()
+    elsewhere = se3_exp(np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+    class Other(Fits):
+        def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
+            right = sees_own(other, 3)
+            wrong = Placement(elsewhere @ right.T_camera_world, right.landmark_ids)
+            if keyframe is other.keyframes[2]:  # is the candidate's own place found elsewhere in its map?
+                return wrong if alike == "the place itself" and candidate == 5 else None
+            if candidate == 2:
+                return right
+            return wrong if alike == "in the other map" and candidate == 4 else None
+
+    class Home(Fits):
+        def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
+            found = sees_own(home, 3)
+            return (
+                Placement(elsewhere @ found.T_camera_world, found.landmark_ids)
+                if alike == "at home"
+                else None
+            )
+
+    places = Other(other)
+    monkeypatch.setattr(places.places, "query_vector", lambda *_, **__: [(k, 1.0) for k in (2, 4, 5)])
+    found = find_meeting(home.keyframes[3], Home(home), places, min_inliers=8)
+    assert (found is not None) == (alike == "nowhere")
+    if found is not None:
+        assert found.similarity.scale == pytest.approx(1.4)
+        np.testing.assert_allclose(found.similarity.T_a_b, OTHER_HOME.T_a_b, atol=1e-9)

@@ -4,6 +4,9 @@
 After ORB-SLAM3 (Campos et al., "ORB-SLAM3: An Accurate Open-Source Library for Visual, Visual-Inertial and
 Multi-Map SLAM", 2021, section VI): a place is recognised by several keyframes, not by one. Two maps that are
 joined wrongly cannot be told apart again, so keyframes must agree on the whole similarity, scale included.
+Where places look alike that is not enough: along one of two rows of equal desks all keyframes agree on the
+other row. No odometry between the maps contradicts them, but there the maps look like themselves, too. So a
+place counts only if it is unique: nothing else in either map looks like it by the same verification.
 """
 
 from __future__ import annotations
@@ -22,6 +25,9 @@ from slamdepth.mapping.placement import Placement
 from slamdepth.typing import Floats, Floats32, Ints
 
 _CANDIDATES = 2
+_LOOK_ALIKES = 8  # keyframes that a place is compared with before it is taken for unique
+_ALREADY_LINKED = 15  # shared landmarks that make two keyframes neighbours
+_ELSEWHERE = (0.3, 0.3)  # radians, and share of the distance of what is seen: more is another place
 _MIN_SCORE_SHARE = 0.6  # of the similarity of two neighbours in time
 _FEWEST_DEPTHS = 10  # features with a landmark in both maps, which give the scale between them
 _AGREEING = 3  # keyframes that must say the same
@@ -34,7 +40,7 @@ _MAX_LOG_SCALE_PREDICTED = 1.1  # a network errs by a factor of three hardly eve
 
 
 class Place(Protocol):
-    """Another map, as far as a keyframe can be looked for in it."""
+    """A map, as far as a keyframe can be looked for in it."""
 
     @property
     def map(self) -> MapView: ...
@@ -101,27 +107,63 @@ class Meeting:
         )
 
 
-def find_meeting(
-    keyframe: MapKeyframe, home: MapView, words: Floats32, least_score: float, other: Place, min_inliers: int
-) -> Meeting | None:
+def find_meeting(keyframe: MapKeyframe, home: Place, other: Place, min_inliers: int) -> Meeting | None:
     """Look for a keyframe in another map.
 
     Args:
-        home: the keyframe's map.
-        words: place vector ``(W,)`` of the keyframe.
-        least_score: similarity of places below which nothing is tried.
+        keyframe: of ``home``, not its first one.
         min_inliers: landmarks that must agree.
     """
+    words = home.places.vector(keyframe.id)
+    least = _MIN_SCORE_SHARE * home.places.score(keyframe.id, keyframe.id - 1)
     for candidate, score in other.places.query_vector(words, top_k=_CANDIDATES):
-        if score < _MIN_SCORE_SHARE * least_score:
+        if score < least:
             return None
         placement = other.place_keyframe(keyframe, candidate)
         if placement is None or placement.inliers < min_inliers:
             continue
-        meeting = _meeting(keyframe, home, other.map, candidate, placement)
-        if meeting is not None:
+        meeting = _meeting(keyframe, home.map, other.map, candidate, placement)
+        if meeting is not None and _is_unique(meeting, home, other, words, min_inliers):
             return meeting
     return None
+
+
+def _is_unique(meeting: Meeting, home: Place, other: Place, words: Floats32, min_inliers: int) -> bool:
+    """Whether the keyframe looks like one place of either map only, and so does the one it is placed by."""
+    candidate = meeting.pose.keyframe
+    views = (
+        (meeting.keyframe, words, other, meeting.pose.T_camera_world, meeting.distance_m),
+        (candidate, other.places.vector(candidate.id), other, candidate.T_camera_world, meeting.distance_m),
+        (meeting.keyframe, words, home, meeting.keyframe.T_camera_world, meeting.distance_m / meeting.scale),
+    )
+    return not any(_fits_elsewhere(*view, min_inliers) for view in views)
+
+
+def _fits_elsewhere(
+    keyframe: MapKeyframe,
+    words: Floats32,
+    place: Place,
+    T_camera_world: Floats,
+    distance_m: float,
+    min_inliers: int,
+) -> bool:
+    """Whether a keyframe fits a map in another place than at ``T_camera_world (4, 4)``."""
+    shared = place.map.shared_landmarks(keyframe.landmark_ids) if _is_of(keyframe, place.map) else None
+    for k, _ in place.places.query_vector(words, top_k=_LOOK_ALIKES):
+        if shared is not None and (k == keyframe.id or shared[k] >= _ALREADY_LINKED):
+            continue
+        placement = place.place_keyframe(keyframe, k)
+        if placement is None or placement.inliers < min_inliers:
+            continue
+        D = placement.T_camera_world @ invert(T_camera_world)
+        turned, shifted = float(rotation_angle_rad(D[:3, :3])), float(np.linalg.norm(D[:3, 3]))
+        if turned > _ELSEWHERE[0] or shifted > _ELSEWHERE[1] * distance_m:
+            return True
+    return False
+
+
+def _is_of(keyframe: MapKeyframe, map_: MapView) -> bool:
+    return keyframe.id < len(map_.keyframes) and map_.keyframes[keyframe.id] is keyframe
 
 
 def _meeting(

@@ -2,8 +2,7 @@
 """The maps of a run: a new one where the camera stays lost, and one of two where they meet.
 
 After the Atlas of ORB-SLAM3 (Campos et al., "ORB-SLAM3: An Accurate Open-Source Library for Visual,
-Visual-Inertial and Multi-Map SLAM", 2021). Here a map starts from the depth of a single frame, no second view is
-awaited.
+Visual-Inertial and Multi-Map SLAM", 2021). Here the depth of a single frame starts a map.
 """
 
 from __future__ import annotations
@@ -138,9 +137,8 @@ class Atlas:
         if keyframe.id == 0 or len(self.maps) == 1:
             return False
         words = home.places.vector(keyframe.id)
-        least = home.places.score(keyframe.id, keyframe.id - 1)
         for map_ in sorted(self._others(), key=lambda other: -other.places.best_score(words))[:_LOOKED_AT]:
-            meeting = find_meeting(keyframe, home.map, words, least, map_, self._config.loops.min_inliers)
+            meeting = find_meeting(keyframe, home, map_, self._config.loops.min_inliers)
             if meeting is None:
                 continue
             agreeing = self._meetings[map_.id].add(meeting)
