@@ -4,93 +4,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_up_runs import COUNT, FPS, SCENE_M, facts, kinds, moved_from, states, walk, wall
 
-from slamdepth.evaluation import Health, RunFacts, SpanKind, Verdict, judge_run
+from slamdepth.evaluation import Health, SpanKind, Verdict, judge_run
 from slamdepth.evaluation.leaps import find_leaps, scene_distance
 from slamdepth.geometry import se3_exp
-from slamdepth.types import RunStatistics, StepResult, TrackingStatus, Trajectory
-from slamdepth.typing import Floats
-
-FPS = 30.0
-COUNT = 300
-SCENE_M = 2.0
-
-
-def walk(count: int = COUNT, speed_m: float = 0.005, turn_rad: float = 0.004) -> Floats:
-    """Poses ``(count, 4, 4)`` of a camera that goes sideways and turns, with a hand's jitter."""
-    n = np.arange(count)
-    jitter = np.random.default_rng(0).normal(size=(count, 6)) * 2e-4
-    zero = np.zeros(count)
-    tangents = np.stack([speed_m * n, zero, zero, zero, turn_rad * n, zero], axis=1)
-    return se3_exp(tangents + jitter)
-
-
-def wall() -> Floats:
-    """Points around the path of :func:`walk`, two metres away."""
-    rng = np.random.default_rng(1)
-    direction = rng.normal(size=(4000, 3))
-    points: Floats = SCENE_M * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    return points
-
-
-def facts(
-    poses: Floats | None = None,
-    states: Sequence[TrackingStatus] | None = None,
-    inliers: Sequence[int] | int = 200,
-    keyframe_every: int = 10,
-    fps: float = FPS,
-    *,
-    depth_is_measured: bool = False,
-    statistics: RunStatistics | None = None,
-) -> RunFacts:
-    """A run of a path; frames that are lost leave no pose. Times begin late, as a recording's often do."""
-    poses = walk() if poses is None else poses
-    count = len(poses)
-    states = [TrackingStatus.TRACKING] * count if states is None else states
-    counts = [inliers] * count if isinstance(inliers, int) else inliers
-    unplaced = (TrackingStatus.LOST, TrackingStatus.INITIALISING)
-    steps = tuple(
-        StepResult(
-            n,
-            1.3e9 + n / fps,
-            states[n],
-            None if states[n] in unplaced else poses[n],
-            counts[n],
-            is_keyframe=n % keyframe_every == 0,
-        )
-        for n in range(count)
-    )
-    placed = [step for step in steps if step.T_world_camera is not None]
-    trajectory = Trajectory(
-        np.array([step.timestamp_s for step in placed]),
-        poses[[step.index for step in placed]],
-    )
-    statistics = replace(statistics or RunStatistics(), frames=count, tracked=len(placed))
-    return RunFacts(steps, trajectory, wall(), statistics, depth_is_measured)
-
-
-def states(count: int, *changes: tuple[int, int, TrackingStatus]) -> list[TrackingStatus]:
-    """Tracked frames, but for ``(first, behind the last, status)`` stretches."""
-    made = [TrackingStatus.TRACKING] * count
-    for first, end, status in changes:
-        made[first:end] = [status] * (end - first)
-    return made
-
-
-def kinds(health: Health) -> list[SpanKind]:
-    return [span.kind for span in health.spans]
-
-
-def moved_from(poses: Floats, n: int, shift_m: float, end: int | None = None) -> Floats:
-    """The path with all poses from the ``n``-th on (up to ``end``) moved sideways."""
-    poses = poses.copy()
-    poses[n:end, 1, 3] += shift_m
-    return poses
+from slamdepth.types import RunStatistics, TrackingStatus
 
 
 def test_a_steady_path_is_good_and_says_so_in_one_line() -> None:
@@ -104,7 +27,7 @@ def test_a_steady_path_is_good_and_says_so_in_one_line() -> None:
 def test_a_verdict_can_be_written_as_json() -> None:
     lost = states(COUNT, (60, 160, TrackingStatus.LOST))
     written = json.loads(json.dumps(judge_run(facts(states=lost)).to_dict()))
-    assert list(written) == ["verdict", "headline", "reasons", "spans", "numbers"]
+    assert list(written) == ["verdict", "headline", "reasons", "spans", "numbers", "maps"]
     assert written["verdict"] == "not trustworthy"
     assert list(written["spans"][0]) == ["from_s", "to_s", "kind", "why"]
     assert written["spans"][0]["kind"] == "lost"
@@ -266,6 +189,9 @@ def test_a_path_without_a_unit_is_good_in_shape_and_says_so() -> None:
     health = judge_run(replace(known, trajectory=replace(known.trajectory, is_metric=False)))
     assert health.verdict is Verdict.GOOD
     assert "unit of length is unknown" in health.reasons[0]
+    unsure = judge_run(replace(known, scale_is_known=False))
+    assert unsure.verdict is Verdict.GOOD
+    assert "size of the path is unknown" in unsure.reasons[0]
 
 
 @pytest.mark.parametrize(("placed", "says"), [(0, "no frame has a pose"), (1, "a single frame has a pose")])

@@ -91,7 +91,7 @@ def test_summary_has_the_promised_keys_and_values() -> None:
 
 def test_the_verdict_is_in_the_figures_with_reasons_spans_and_numbers() -> None:
     health = json.loads(json.dumps(build_summary(full_data())["health"]))
-    assert list(health) == ["verdict", "headline", "reasons", "spans", "numbers"]
+    assert list(health) == ["verdict", "headline", "reasons", "spans", "numbers", "maps"]
     assert health["verdict"] == "doubtful"
     assert [span["kind"] for span in health["spans"]] == ["no map yet", "lost"]
     assert health["numbers"]["tracked_share"] == 70 / 80

@@ -6,8 +6,9 @@ from __future__ import annotations
 from slamdepth.evaluation.bootstrap import Interval
 from slamdepth.evaluation.depth import DepthErrors, DepthScore, DepthScorer
 from slamdepth.evaluation.depth_judge import DepthJudge, DepthJudgement, mean_over_sets
-from slamdepth.evaluation.health import Health, judge_run
-from slamdepth.evaluation.health_facts import HealthNumbers, RunFacts
+from slamdepth.evaluation.health import Health, MapHealth, judge_run
+from slamdepth.evaluation.health_facts import MapFacts, RunFacts
+from slamdepth.evaluation.health_numbers import HealthNumbers
 from slamdepth.evaluation.health_rules import Verdict
 from slamdepth.evaluation.health_spans import HealthSpan, SpanKind
 from slamdepth.evaluation.trajectory import (
@@ -30,6 +31,8 @@ __all__ = [
     "HealthNumbers",
     "HealthSpan",
     "Interval",
+    "MapFacts",
+    "MapHealth",
     "RelativeError",
     "RunFacts",
     "SpanKind",

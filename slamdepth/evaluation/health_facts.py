@@ -1,17 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a verdict on a run rests on."""
+"""What a run, and each of its maps, knows of itself."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from slamdepth.evaluation.health_spans import HealthSpan, SpanKind
-from slamdepth.evaluation.leaps import judged_steps
-from slamdepth.types import RunStatistics, StepResult, TrackingStatus, Trajectory
+from slamdepth.types import RunStatistics, StepResult, Trajectory
 from slamdepth.typing import Floats
+
+
+@dataclass(frozen=True)
+class MapFacts:
+    """A further map of a run, which never met the judged one.
+
+    Attributes:
+        trajectory: its path in its own frame.
+        points_w: ``(P, 3)`` its points in that frame, in the unit of its path.
+        statistics: counts of what is in it.
+    """
+
+    trajectory: Trajectory
+    points_w: Floats
+    statistics: RunStatistics
 
 
 @dataclass(frozen=True)
@@ -20,11 +34,14 @@ class RunFacts:
 
     Attributes:
         steps: one for each frame, in order; empty where they were not kept.
-        trajectory: the final path.
+        trajectory: the final path, of the largest map where there are several.
         points_w: ``(P, 3)`` map points, world frame, in the unit of the path.
         statistics: counts of the run.
         depth_is_measured: True where a sensor measured the depth.
         least_inliers: with fewer inliers the tracker takes a frame for lost.
+        others: the maps that never met this one, the largest first.
+        scale_is_known: False where nothing is known of the size of the path.
+        first_s: time that spans are counted from; None: that of the first frame.
     """
 
     steps: Sequence[StepResult]
@@ -33,6 +50,9 @@ class RunFacts:
     statistics: RunStatistics
     depth_is_measured: bool
     least_inliers: int = 20
+    others: Sequence[MapFacts] = ()
+    scale_is_known: bool = True
+    first_s: float | None = None
 
     @property
     def frame_s(self) -> float:
@@ -40,68 +60,48 @@ class RunFacts:
         times_s = [step.timestamp_s for step in self.steps]
         return float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
 
+    @property
+    def start_s(self) -> float:
+        """Time that spans are counted from."""
+        if self.first_s is not None:
+            return self.first_s
+        if self.steps:
+            return self.steps[0].timestamp_s
+        return float(self.trajectory.timestamps_s[0]) if len(self.trajectory) else 0.0
 
-@dataclass(frozen=True)
-class HealthNumbers:
-    """The figures a verdict rests on; None where they cannot be said.
+    @cached_property
+    def members(self) -> frozenset[float]:
+        """Times of the frames in this map."""
+        return frozenset(self.trajectory.timestamps_s.tolist())
 
-    Attributes:
-        tracked_share: frames with a pose, of all frames.
-        lost_share: lost frames, of all frames.
-        no_map_share: frames before the map was started, of all frames.
-        longest_loss_s: longest stretch of lost frames in seconds.
-        leaps: steps that the motion around them contradicts (:func:`slamdepth.evaluation.leaps.find_leaps`).
-        judged_step_share: steps short enough in time to be judged, of all.
-        weak_share: frames within spans of weak tracking, of the frames with a pose, by time.
-        registered_share: frames placed by registration of their depth, of the frames with a pose.
-        frames_per_keyframe: frames with a pose for each keyframe.
-        loop_closures, loops_refused: loops that were closed, and verified ones that were not believed.
-        scale_spread_log: robust standard deviation of the keyframes' votes on the map's scale.
-    """
+    @cached_property
+    def elsewhere(self) -> frozenset[float]:
+        """Times of the frames in the other maps."""
+        return frozenset(t for one in self.others for t in one.trajectory.timestamps_s.tolist())
 
-    tracked_share: float | None
-    lost_share: float | None
-    no_map_share: float | None
-    longest_loss_s: float
-    leaps: int
-    judged_step_share: float | None
-    weak_share: float | None
-    registered_share: float | None
-    frames_per_keyframe: float | None
-    loop_closures: int
-    loops_refused: int
-    scale_spread_log: float | None
+    def is_withdrawn(self, step: StepResult) -> bool:
+        """Whether the pose that a step gave is in no map of the result."""
+        is_placed = step.timestamp_s in self.members or step.timestamp_s in self.elsewhere
+        return step.T_world_camera is not None and not is_placed
 
+    def of_each_map(self) -> list[RunFacts]:
+        """What the run knows of each map, the judged one first: its frames from its first to its last."""
+        own = MapFacts(self.trajectory, self.points_w, self.statistics)
+        maps = (own, *self.others)
+        return [self._of_map(one, tuple(other for other in maps if other is not one)) for one in maps]
 
-def measure_health(facts: RunFacts, spans: Sequence[HealthSpan], leaps: int) -> HealthNumbers:
-    """The figures of a run.
-
-    Args:
-        spans: of :func:`slamdepth.evaluation.health_spans.find_spans`.
-        leaps: how many there are.
-    """
-    steps, run = facts.steps, facts.statistics
-    placed = sum(step.T_world_camera is not None for step in steps)
-    keyframes = sum(step.is_keyframe for step in steps)
-    judged = judged_steps(facts.trajectory)
-    weak_s = sum(span.duration_s for span in spans if span.kind is SpanKind.WEAK)
-    placed_s = placed * facts.frame_s
-    votes = np.array(run.scale_votes)
-
-    def share(status: TrackingStatus, of: int) -> float | None:
-        return sum(step.status is status for step in steps) / of if of else None
-
-    return HealthNumbers(
-        tracked_share=run.tracked / run.frames if run.frames else None,
-        lost_share=share(TrackingStatus.LOST, len(steps)),
-        no_map_share=share(TrackingStatus.INITIALISING, len(steps)),
-        longest_loss_s=max((span.duration_s for span in spans if span.kind is SpanKind.LOST), default=0.0),
-        leaps=leaps,
-        judged_step_share=float(np.mean(judged)) if len(judged) else None,
-        weak_share=min(1.0, weak_s / placed_s) if placed_s else None,
-        registered_share=share(TrackingStatus.REGISTERED, placed),
-        frames_per_keyframe=placed / keyframes if keyframes else None,
-        loop_closures=run.loop_closures,
-        loops_refused=run.loops_refused,
-        scale_spread_log=1.4826 * float(np.median(np.abs(votes - np.median(votes)))) if len(votes) else None,
-    )
+    def _of_map(self, one: MapFacts, others: tuple[MapFacts, ...]) -> RunFacts:
+        times_s = one.trajectory.timestamps_s
+        steps = [
+            step for step in self.steps if len(times_s) and times_s[0] <= step.timestamp_s <= times_s[-1]
+        ]
+        counts = replace(one.statistics, frames=len(steps) or len(times_s), tracked=len(times_s))
+        return replace(
+            self,
+            steps=steps,
+            trajectory=one.trajectory,
+            points_w=one.points_w,
+            statistics=counts,
+            others=others,
+            first_s=self.start_s,
+        )

@@ -14,7 +14,8 @@ from enum import Enum
 
 import numpy as np
 
-from slamdepth.evaluation.health_facts import HealthNumbers, RunFacts
+from slamdepth.evaluation.health_facts import RunFacts
+from slamdepth.evaluation.health_numbers import HealthNumbers
 from slamdepth.evaluation.health_spans import LONG_S, HealthSpan, SpanKind
 from slamdepth.evaluation.leaps import MAX_STEP_S
 from slamdepth.types import TrackingStatus
@@ -22,7 +23,7 @@ from slamdepth.types import TrackingStatus
 WEAK = 2
 """Times the least inliers that the tracker accepts: one group of wrong matches less, and it would be lost."""
 
-_MUCH_LOST = 0.2  # of all frames
+_MUCH_LOST = 0.2  # of all frames; also of those withdrawn or in another map
 _SOME_LOST = 0.05
 _LONG_START = 0.1
 _MANY_LEAPS = 3  # two are one wrong pose, there and back
@@ -45,11 +46,16 @@ class Verdict(str, Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """What one rule says: how grave it is, in a few words, and as a sentence."""
+    """What one rule says: how grave it is, in a few words, and as a sentence.
+
+    Attributes:
+        is_local: the evidence lies in spans, so that stretches without one are not doubted.
+    """
 
     level: Verdict
     short: str
     sentence: str
+    is_local: bool = True
 
 
 Rule = Callable[[RunFacts, HealthNumbers, Sequence[HealthSpan]], "Finding | None"]
@@ -73,15 +79,49 @@ def _losses(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]
     share = numbers.lost_share or 0.0
     if share < _SOME_LOST and numbers.longest_loss_s < LONG_S:
         return None
-    level = Verdict.NOT_TRUSTWORTHY if share > _MUCH_LOST else Verdict.DOUBTFUL
     where = _where(spans, SpanKind.LOST)
     is_lost_at_the_end = bool(facts.steps) and facts.steps[-1].status is TrackingStatus.LOST
     end = "it was not found again" if is_lost_at_the_end else "parts before and after may not fit together"
     return Finding(
-        level,
+        _level_of(share),
         f"{percent(share)} of the frames were lost ({where})",
         f"The camera was lost for {percent(share)} of the frames: {where}. The longest loss took "
         f"{numbers.longest_loss_s:.1f} s; {end}.",
+    )
+
+
+def _withdrawn(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """A pose was believed and then taken out. What is left is the better for it, but tracking had gone wrong
+    there unnoticed, and may have elsewhere.
+
+    A single blurred image does the same, so that a few are stated and no doubt.
+    """
+    share = numbers.withdrawn_share or 0.0
+    if not share:
+        return None
+    where = _where(spans, SpanKind.WITHDRAWN)
+    return Finding(
+        _level_of(share) if share >= _SOME_LOST else Verdict.GOOD,
+        f"{percent(share)} of the poses were withdrawn ({where})",
+        f"{percent(share)} of the frames have no pose, because what followed did not confirm it: {where}.",
+    )
+
+
+def _several_maps(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """Maps that never met have no common frame, so a frame in another map is as good as lost for this one.
+
+    A few frames of another place at the start or the end look the same, and leave the largest map as it is.
+    """
+    share = numbers.outside_share or 0.0
+    if not facts.others:
+        return None
+    others = "another map" if len(facts.others) == 1 else f"{len(facts.others)} other maps"
+    where = _where(spans, SpanKind.OTHER_MAP)
+    return Finding(
+        _level_of(numbers.missing_share) if share >= _SOME_LOST else Verdict.GOOD,
+        f"{percent(share)} of the frames are in {others} ({where})",
+        f"{percent(share)} of the frames are in {others} that never met this one: {where}. Maps have no "
+        "common frame, and each has its own scale.",
     )
 
 
@@ -166,6 +206,7 @@ def _keyframe_rate(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Heal
         Verdict.DOUBTFUL,
         "landmarks are hardly found again",
         f"Every {rate:.1f} frames the map needed a new keyframe: landmarks are hardly found again.",
+        is_local=False,
     )
 
 
@@ -184,6 +225,7 @@ def _refused_loops(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Heal
         f"{refused} loops contradicted the path",
         f"{refused} loops were refused because they contradict the path; loops closed: {closed}. Either "
         "places look alike here, or the path has drifted.",
+        is_local=False,
     )
 
 
@@ -194,9 +236,10 @@ def _scale(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan])
     right; ``scale`` in the report says what is known of it.
     """
     spread = numbers.scale_spread_log
-    if not facts.trajectory.is_metric:
+    if not facts.trajectory.is_metric or not facts.scale_is_known:
+        what = "size of the path" if facts.trajectory.is_metric else "unit of length"
         return Finding(
-            Verdict.GOOD, "no unit", "The unit of length is unknown: the path has a shape, no size."
+            Verdict.GOOD, "scale unknown", f"The {what} is unknown: the path has a shape, no size."
         )
     if spread is None or spread <= _SCALE_SPREAD_LOG:
         return None
@@ -204,6 +247,7 @@ def _scale(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan])
         Verdict.DOUBTFUL,
         "the scale varies along the path",
         f"Keyframes disagree on the scale by a factor of {np.exp(spread):.1f} (one standard deviation).",
+        is_local=False,
     )
 
 
@@ -221,6 +265,8 @@ def _sparse_footage(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Hea
 RULES: tuple[Rule, ...] = (
     _no_path,
     _losses,
+    _withdrawn,
+    _several_maps,
     _leaps,
     _weak_tracking,
     _registration,
@@ -235,6 +281,11 @@ RULES: tuple[Rule, ...] = (
 def leaps_are_judged(numbers: HealthNumbers) -> bool:
     """Whether most steps are short enough in time to be told from a leap."""
     return numbers.judged_step_share is None or numbers.judged_step_share >= _MOSTLY
+
+
+def _level_of(missing: float) -> Verdict:
+    """How grave it is that a share of all frames is missing, given that it matters at all."""
+    return Verdict.NOT_TRUSTWORTHY if missing > _MUCH_LOST else Verdict.DOUBTFUL
 
 
 def _where(spans: Sequence[HealthSpan], kind: SpanKind) -> str:

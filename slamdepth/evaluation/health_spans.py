@@ -10,11 +10,15 @@ from itertools import groupby
 
 import numpy as np
 
-from slamdepth.types import StepResult, TrackingStatus, Trajectory
+from slamdepth.evaluation.health_facts import RunFacts
+from slamdepth.types import StepResult, TrackingStatus
 from slamdepth.typing import Ints
 
 LONG_S = 1.0
 """What lasts shorter is bridged: the camera still shows what it showed before, and moves as it did."""
+
+GOOD_SPAN_S = 5.0
+"""Shorter stretches are not called good: there is too little path to be wrong about."""
 
 _PLACED_BY_POINTS = (TrackingStatus.TRACKING, TrackingStatus.RELOCALISED)
 
@@ -27,6 +31,8 @@ class SpanKind(str, Enum):
     WEAK = "weak tracking"
     LEAP = "leap"
     REGISTERED = "registered by depth only"
+    WITHDRAWN = "pose withdrawn"
+    OTHER_MAP = "in another map"
 
 
 @dataclass(frozen=True)
@@ -55,31 +61,54 @@ class HealthSpan:
         return f"{self.from_s:.1f}-{self.to_s:.1f} s"
 
 
-def find_spans(
-    steps: Sequence[StepResult], trajectory: Trajectory, leaps: Ints, weak_inliers: int
-) -> tuple[HealthSpan, ...]:
+def find_spans(facts: RunFacts, leaps: Ints, weak_inliers: int) -> tuple[HealthSpan, ...]:
     """All spans of a run in order of time.
 
-    Losses count however short they are, weak and registered stretches from one second on.
+    Losses, withdrawn poses and other maps count however short they are, weak and registered stretches from
+    one second on.
 
     Args:
-        steps: one for each frame, in order.
-        trajectory: the final path.
-        leaps: steps of ``trajectory``, see :func:`slamdepth.evaluation.leaps.find_leaps`.
+        leaps: steps of the trajectory, see :func:`slamdepth.evaluation.leaps.find_leaps`.
         weak_inliers: fewer points that agree with a pose make it a weak one.
     """
 
     def is_weak(step: StepResult) -> bool:
-        return step.status in _PLACED_BY_POINTS and step.inliers < weak_inliers
+        is_placed = step.status in _PLACED_BY_POINTS and step.timestamp_s in facts.members
+        return is_placed and step.inliers < weak_inliers
+
+    def is_registered(step: StepResult) -> bool:
+        return step.status is TrackingStatus.REGISTERED and step.timestamp_s in facts.members
+
+    def is_elsewhere(step: StepResult) -> bool:
+        return step.timestamp_s in facts.elsewhere
 
     spans = [
-        *_stretches(steps, _has(TrackingStatus.INITIALISING), SpanKind.NO_MAP, _no_map),
-        *_stretches(steps, _has(TrackingStatus.LOST), SpanKind.LOST, _lost),
-        *_stretches(steps, is_weak, SpanKind.WEAK, _weak, LONG_S),
-        *_stretches(steps, _has(TrackingStatus.REGISTERED), SpanKind.REGISTERED, _registered, LONG_S),
-        *_leap_spans(steps, trajectory, leaps),
+        *_stretches(facts, _has(TrackingStatus.INITIALISING), SpanKind.NO_MAP, _no_map),
+        *_stretches(facts, _has(TrackingStatus.LOST), SpanKind.LOST, _lost),
+        *_stretches(facts, facts.is_withdrawn, SpanKind.WITHDRAWN, _withdrawn),
+        *_stretches(facts, is_elsewhere, SpanKind.OTHER_MAP, _elsewhere),
+        *_stretches(facts, is_weak, SpanKind.WEAK, _weak, LONG_S),
+        *_stretches(facts, is_registered, SpanKind.REGISTERED, _registered, LONG_S),
+        *_leap_spans(facts, leaps),
     ]
     return tuple(sorted(spans, key=lambda span: (span.from_s, span.to_s)))
+
+
+def find_good_spans(facts: RunFacts, spans: Sequence[HealthSpan]) -> tuple[tuple[float, float], ...]:
+    """Stretches of at least five seconds with nothing to look at, seconds since the first frame.
+
+    Args:
+        spans: of :func:`find_spans`.
+    """
+    times_s = facts.trajectory.timestamps_s
+    if not len(times_s):
+        return ()
+    edges = [float(times_s[0]) - facts.start_s]
+    for span in sorted(spans, key=lambda span: span.from_s):
+        edges += [span.from_s, max(span.to_s, *edges)]
+    edges.append(float(times_s[-1]) - facts.start_s)
+    stretches = zip(edges[::2], edges[1::2], strict=True)
+    return tuple((from_s, to_s) for from_s, to_s in stretches if to_s - from_s >= GOOD_SPAN_S)
 
 
 def _has(status: TrackingStatus) -> Callable[[StepResult], bool]:
@@ -87,20 +116,21 @@ def _has(status: TrackingStatus) -> Callable[[StepResult], bool]:
 
 
 def _stretches(
-    steps: Sequence[StepResult],
+    facts: RunFacts,
     belongs: Callable[[StepResult], bool],
     kind: SpanKind,
     why: Callable[[Sequence[StepResult]], str],
     least_s: float = 0.0,
 ) -> list[HealthSpan]:
     """Spans of consecutive frames; each ends where the next frame begins."""
+    steps, start_s = facts.steps, facts.start_s
     found = []
     for is_in, group in groupby(range(len(steps)), key=lambda n: belongs(steps[n])):
         at = list(group)
         if not is_in:
             continue
-        from_s = steps[at[0]].timestamp_s - steps[0].timestamp_s
-        to_s = steps[min(at[-1] + 1, len(steps) - 1)].timestamp_s - steps[0].timestamp_s
+        from_s = steps[at[0]].timestamp_s - start_s
+        to_s = steps[min(at[-1] + 1, len(steps) - 1)].timestamp_s - start_s
         if to_s - from_s >= least_s:
             found.append(HealthSpan(from_s, to_s, kind, why([steps[n] for n in at])))
     return found
@@ -114,6 +144,14 @@ def _lost(steps: Sequence[StepResult]) -> str:
     return f"{len(steps)} frames could not be placed"
 
 
+def _withdrawn(steps: Sequence[StepResult]) -> str:
+    return f"{len(steps)} frames were placed, and taken out again: what followed did not confirm them"
+
+
+def _elsewhere(steps: Sequence[StepResult]) -> str:
+    return f"{len(steps)} frames are in a map that never met this one"
+
+
 def _weak(steps: Sequence[StepResult]) -> str:
     median = int(np.median([step.inliers for step in steps]))
     return f"{len(steps)} frames were placed by {median} map points each (median)"
@@ -123,13 +161,7 @@ def _registered(steps: Sequence[StepResult]) -> str:
     return f"{len(steps)} frames were placed by the shape of their depth, without map points"
 
 
-def _leap_spans(steps: Sequence[StepResult], trajectory: Trajectory, leaps: Ints) -> list[HealthSpan]:
-    times_s = trajectory.timestamps_s
-    if not len(leaps):
-        return []
-    start_s = steps[0].timestamp_s if steps else float(times_s[0])
+def _leap_spans(facts: RunFacts, leaps: Ints) -> list[HealthSpan]:
+    times_s = facts.trajectory.timestamps_s - facts.start_s
     why = "the frames before and after do not confirm the step"
-    return [
-        HealthSpan(float(times_s[n]) - start_s, float(times_s[n + 1]) - start_s, SpanKind.LEAP, why)
-        for n in leaps
-    ]
+    return [HealthSpan(float(times_s[n]), float(times_s[n + 1]), SpanKind.LEAP, why) for n in leaps]
