@@ -225,6 +225,21 @@ def test_writer_lines_are_readable_while_it_is_open(tmp_path: Path) -> None:
         writer.append(9.0, T[0])
 
 
+def test_a_comment_between_poses_is_skipped_by_readers(tmp_path: Path) -> None:
+    from evo.tools import file_interface
+
+    path, T = tmp_path / "t.txt", poses(2)
+    with TrajectoryWriter(path) as writer:
+        writer.append(0.0, T[0])
+        writer.comment("another world frame")
+        writer.append(0.1, T[1])
+        with pytest.raises(ValueError, match="one line"):
+            writer.comment("two\nlines")
+    assert path.read_text().splitlines()[2] == "# another world frame"
+    assert len(read_tum_trajectory(path)[0]) == 2
+    assert file_interface.read_tum_trajectory_file(str(path)).num_poses == 2
+
+
 def test_writer_survives_kill_9(tmp_path: Path) -> None:
     path = tmp_path / "t.txt"
     code = (

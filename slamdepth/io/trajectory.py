@@ -77,6 +77,20 @@ class TrajectoryWriter:
             self._sync()
             self._synced_at_s = now_s
 
+    def comment(self, text: str) -> None:
+        """Add a line that readers of trajectories skip.
+
+        Args:
+            text: one line of ASCII, without the leading ``#``.
+
+        Raises:
+            OutputError: the file cannot be written.
+            ValueError: ``text`` has more than one line, or the writer is closed.
+        """
+        if "\n" in text:
+            raise ValueError(f"a comment is one line, got {text!r}")
+        self._write(f"# {text}\n")
+
     def close(self) -> None:
         """Synchronise with the disk and close; a second call does nothing."""
         if not self._file.closed:

@@ -81,6 +81,7 @@ def track(
     """
     steps: list[StepResult] = []
     skipped = 0
+    map_id = 0
     start_s: float | None = None
     total = len(indices)
     reader = FramePrefetcher(dataset, indices, with_depth=with_depth, prepare=tracker.prepare)
@@ -103,6 +104,11 @@ def track(
             result = tracker.step(item.frame, item.prepared)
             steps.append(result)
             if result.T_world_camera is not None:
+                if result.map_id != map_id:
+                    map_id = result.map_id
+                    online.comment(
+                        f"from here on in the world frame of map {map_id + 1}, as maps were started"
+                    )
                 online.append(result.timestamp_s, result.T_world_camera)
             progress(_state(result, len(steps) + skipped, total, len(steps), start_s))
     if start_s is None:
