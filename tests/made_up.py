@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from slamdepth.datasets import Dataset
 from slamdepth.errors import CameraError, ImageDecodeError
+from slamdepth.geometry import invert
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.tracking.tracker import Tracker
 from slamdepth.types import Camera, Frame, RunStatistics, StepResult, TrackingStatus, Trajectory
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
@@ -85,3 +88,36 @@ class MadeUpTracker:
         trajectory = Trajectory(np.array(placed) / 10.0, np.array([pose(i) for i in placed]))
         statistics = RunStatistics(len(self.seen), len(placed), timings_ms={"tracking": 1.0})
         return Reconstruction(trajectory, (), np.zeros((0, 3)), statistics=statistics)
+
+
+class TwoMapTracker(Tracker):
+    """The real tracker, whose result is cut into two maps at frame ``CUT``."""
+
+    CUT = 16
+
+    def step(self, frame: Frame, prepared: object = None) -> StepResult:
+        result = super().step(frame, prepared)  # type: ignore[arg-type]
+        return replace(result, map_id=int(frame.index >= self.CUT))
+
+    def finish(self) -> Reconstruction:
+        whole = super().finish()
+        first, second = _part(whole, slice(None, self.CUT)), _part(whole, slice(self.CUT, None))
+        return replace(first, others=(second,))
+
+
+def _part(whole: Reconstruction, frames: slice) -> Reconstruction:
+    """Some frames of a reconstruction, in the frame of the first of them."""
+    path = whole.trajectory
+    times_s, poses = path.timestamps_s[frames], path.T_world_camera[frames]
+    T = invert(poses[0])
+    keyframes = tuple(
+        replace(keyframe, T_world_camera=T @ keyframe.T_world_camera)
+        for keyframe in whole.keyframes
+        if keyframe.frame.timestamp_s in times_s
+    )
+    return replace(
+        whole,
+        trajectory=replace(path, timestamps_s=times_s, T_world_camera=T @ poses),
+        keyframes=keyframes,
+        statistics=replace(whole.statistics, tracked=len(times_s)),
+    )

@@ -3,16 +3,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.depth.alignment import as_given
-from slamdepth.evaluation import DepthScorer, Health, RunFacts, judge_run, score_trajectory
+from slamdepth.evaluation import DepthScorer, Health, MapFacts, RunFacts, judge_run, score_trajectory
 from slamdepth.geometry import se3_exp
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report import (
+    MapData,
     MeshCounts,
     ReportData,
     ScaleFacts,
@@ -71,7 +74,10 @@ def keyframe(number: int, *, is_sensor: bool = False) -> Keyframe:
 
 
 def health_of(run: Reconstruction, steps: tuple[StepResult, ...] = ()) -> Health:
-    return judge_run(RunFacts(steps, run.trajectory, run.points_m, run.statistics, depth_is_measured=False))
+    others = tuple(MapFacts(one.trajectory, one.points_m, one.statistics) for one in run.others)
+    return judge_run(
+        RunFacts(steps, run.trajectory, run.points_m, run.statistics, depth_is_measured=False, others=others)
+    )
 
 
 def full_data() -> ReportData:
@@ -123,6 +129,32 @@ def full_data() -> ReportData:
         options={"stride": 1, "max_frames": None},
         files={"mesh.ply": "coloured mesh"},
     )
+
+
+def several_maps_data() -> ReportData:
+    """A run of 90 frames: 70 in the largest map, 6 and 4 in two that never met it, 10 without a pose."""
+    data = full_data()
+    others = []
+    for first, count, factor in ((81, 6, 2.0), (87, 4, 0.5)):
+        poses = trajectory().T_world_camera[:count].copy()
+        poses[:, :3, 3] *= factor
+        path = Trajectory(100.0 + np.arange(first, first + count) / 30.0, poses)
+        others.append(
+            Reconstruction(path, (), np.zeros((5, 3)), statistics=RunStatistics(frames=count, tracked=count))
+        )
+    placed = [
+        StepResult(80 + n, 100.0 + n / 30, TrackingStatus.TRACKING, np.eye(4), 90, map_id=1 + (n > 86))
+        for n in range(81, 91)
+    ]
+    run = replace(
+        data.reconstruction,
+        others=tuple(others),
+        statistics=replace(data.reconstruction.statistics, frames=90, maps_joined=1),
+    )
+    steps = (*data.steps, *placed)
+    scales = (SCALE, ScaleFacts(ScaleSource.VALUE, 1.5, "A number.", None))
+    maps = tuple(MapData(one, scale) for one, scale in zip(others, scales, strict=True))
+    return replace(data, reconstruction=run, steps=steps, others=maps, health=health_of(run, steps))
 
 
 def bare_data() -> ReportData:

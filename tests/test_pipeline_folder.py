@@ -11,7 +11,7 @@ import pytest
 
 from slamdepth.errors import OutputError
 from slamdepth.io import writable_file
-from slamdepth.pipeline.folder import FILES, RunFolder, run_log, write_log_to
+from slamdepth.pipeline.folder import FILES, MAPS, RunFolder, run_log, write_log_to
 from slamdepth.pipeline.options import RunOptions
 from slamdepth.pipeline.run import _arguments
 
@@ -93,11 +93,37 @@ def test_discarding_leaves_what_is_not_ours(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "shared").iterdir()] == ["mine.txt"]
 
 
+def test_files_of_earlier_maps_are_removed_and_no_others(tmp_path: Path) -> None:
+    place, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    folder = RunFolder.plan(place, "desk", overwrite=False)
+    folder.create()
+    assert folder.make_map_folder(1) == place
+    for number in (2, 3):
+        (folder.make_map_folder(number) / "trajectory.txt").write_text("old")
+    (place / "maps" / "3" / "mine.txt").write_text("notes")
+    for path in (place / "maps" / "mine", elsewhere):
+        path.mkdir()
+        (path / "trajectory.txt").write_text("mine")
+    (place / "maps" / "4").symlink_to(elsewhere)
+    RunFolder.plan(place, "desk", overwrite=True).create()
+    left = sorted(path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file())
+    assert left == ["README.txt", "maps/3/mine.txt", "maps/mine/trajectory.txt"]
+    assert (elsewhere / "trajectory.txt").read_text() == "mine"
+
+
+def test_discarding_removes_the_folders_of_maps(tmp_path: Path) -> None:
+    folder = RunFolder.plan(tmp_path / "run", "desk", overwrite=False)
+    folder.create()
+    (folder.make_map_folder(2) / "keyframes.txt").write_text("")
+    folder.discard()
+    assert not (tmp_path / "run").exists()
+
+
 def test_the_readme_lists_every_file(tmp_path: Path) -> None:
     folder = RunFolder.plan(tmp_path / "run", "desk", overwrite=False)
     folder.create()
     text = (folder / "README.txt").read_text()
-    assert all(name in text for name in FILES)
+    assert all(name in text for name in (*FILES, MAPS))
 
 
 def test_the_readme_has_the_command_for_the_same_run_again(tmp_path: Path) -> None:

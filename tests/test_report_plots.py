@@ -19,6 +19,7 @@ from slamdepth.report import (
     build_summary,
 )
 from slamdepth.report import plots as report_plots
+from slamdepth.report.gaps import with_gaps
 from slamdepth.report.keyframe_images import NEAR_TO_FAR, UNKNOWN, colour_depth, keyframe_gallery
 from slamdepth.report.speed import speed_plot, stage_times
 from slamdepth.types import (
@@ -97,7 +98,7 @@ def test_drawing_leaves_no_global_state() -> None:
 
 def test_lost_frames_break_the_curves() -> None:
     times = np.array([0.0, 1.0, 2.0, 7.0, 8.0])
-    values = report_plots._with_gaps(times, np.arange(5.0)[:, None])[:, 0]
+    values = with_gaps(times, np.arange(5.0)[:, None])[:, 0]
     np.testing.assert_array_equal(values, [0, 1, 2, np.nan, 3, 4])
     np.testing.assert_array_equal(report_plots._gap_times(times, 0.0), [0, 1, 2, np.nan, 7, 8])
     np.testing.assert_array_equal(report_plots._gap_times(np.array([3.0])), [0])

@@ -81,6 +81,12 @@ def run_command(
         Path | None,
         typer.Option(metavar="FILE", help="LightGlue's ONNX file, to match whole images with."),
     ] = None,
+    single_map: Annotated[
+        bool,
+        typer.Option(
+            "--single-map", help="Start no new map where the camera stays lost; keep looking for the first."
+        ),
+    ] = False,
     camera: CameraOption = None,
     readout_ms: Annotated[
         float | None,
@@ -137,6 +143,7 @@ def run_command(
                 "baseline_m": baseline_m,
                 "baseline_between_s": baseline_between,
             },
+            "tracking": {"new_maps": False if single_map else None},
             "shutter": {"readout_ms": readout_ms},
             "map": {"voxel_size_m": voxel_size},
         },

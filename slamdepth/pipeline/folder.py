@@ -16,11 +16,12 @@ from slamdepth.errors import OutputError
 from slamdepth.io import writable, write_text
 
 FILES = {
-    "trajectory.txt": "every placed frame after optimisation (TUM format, camera to world)",
-    "trajectory_online.txt": "each frame's pose as it was first placed, written during the run",
+    "trajectory.txt": "every frame placed in the largest map, after optimisation (TUM, camera to world)",
+    "trajectory_online.txt": "each frame's pose as it was first placed, written during the run; a comment "
+    "line says where another map, and so another world frame, begins",
     "keyframes.txt": "the keyframes of trajectory.txt",
     "depth_scale.yaml": "the scale fitted to the sequence's own sensor (--depth-scale groundtruth)",
-    "mesh.ply": "coloured mesh of the scene in the frame of the first camera, metres",
+    "mesh.ply": "coloured mesh of the largest map in the frame of its first camera, metres",
     "mesh.png": "the mesh as a whole with the camera's path, and over the camera's shoulder",
     "report.html": "figures and plots of the run; opens in any browser, needs nothing else",
     "report.json": "the same figures for programs",
@@ -29,6 +30,17 @@ FILES = {
     "README.txt": "this list, and the command for the same run again",
 }
 """What each file of a run folder holds."""
+
+MAPS = "maps/"
+"""Folder of the maps that never met the largest one: ``maps/2/``, ``maps/3/``, ..."""
+
+MAPS_CONTENT = (
+    "2/, 3/, ...: trajectory.txt, keyframes.txt and mesh.ply of each map that never met the largest; every "
+    "map has its own world frame and its own scale"
+)
+"""What :data:`MAPS` holds."""
+
+_MAP_FILES = ("trajectory.txt", "keyframes.txt", "mesh.ply")
 
 _README = "README.txt"
 _MARK = "A run of slamdepth"
@@ -88,10 +100,9 @@ class RunFolder:
         make_folder(self.path)
         if self.replaces:
             with writing(self.path):
-                for name in FILES:
-                    (self.path / name).unlink(missing_ok=True)
+                self._remove_files()
         width = max(map(len, FILES))
-        lines = [f"{name:<{width}}  {what}" for name, what in FILES.items()]
+        lines = [f"{name:<{width}}  {what}" for name, what in {**FILES, MAPS: MAPS_CONTENT}.items()]
         head = f"{_MARK}. A file that is missing was not asked for, or the run was killed before it.\n\n"
         if arguments:
             command = shlex.join(["slamdepth", "run", *arguments, "--config", str(self.path / "config.yaml")])
@@ -101,9 +112,35 @@ class RunFolder:
     def discard(self) -> None:
         """Remove our files, and the folder where nothing else is in it."""
         with suppress(OSError):
-            for name in FILES:
-                (self.path / name).unlink(missing_ok=True)
+            self._remove_files()
             self.path.rmdir()
+
+    def make_map_folder(self, number: int) -> Path:
+        """Make the folder of a map, and return it.
+
+        Args:
+            number: counted from 1 for the largest map, whose folder is the run's.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        folder = self.path if number == 1 else self.path / MAPS / str(number)
+        make_folder(folder)
+        return folder
+
+    def _remove_files(self) -> None:
+        """Remove our files; folders of maps only where nothing else is in them, and never through a link."""
+        for name in FILES:
+            (self.path / name).unlink(missing_ok=True)
+        maps = self.path / MAPS
+        if maps.is_symlink() or not maps.is_dir():
+            return
+        for folder in sorted(maps.iterdir()):
+            if folder.name.isdecimal() and folder.is_dir() and not folder.is_symlink():
+                for name in _MAP_FILES:
+                    (folder / name).unlink(missing_ok=True)
+                _remove_if_empty(folder)
+        _remove_if_empty(maps)
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -149,6 +186,11 @@ def _is_run(path: Path) -> bool:
         return (path / _README).read_text(encoding="utf-8").startswith(_MARK)
     except (OSError, UnicodeDecodeError):
         return False
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def writable_folder(path: Path) -> Path:

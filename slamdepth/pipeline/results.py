@@ -17,6 +17,7 @@ from slamdepth.evaluation import (
     DepthScore,
     DepthScorer,
     Health,
+    MapFacts,
     RunFacts,
     TrajectoryScore,
     judge_run,
@@ -25,7 +26,7 @@ from slamdepth.evaluation import (
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
-from slamdepth.report import MeshCounts, MeshImage, render_mesh_images
+from slamdepth.report import MeshCounts, MeshImage, ScaleFacts, render_mesh_images
 from slamdepth.types import DepthKind, StepResult, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -45,9 +46,17 @@ def keyframe_trajectory(reconstruction: Reconstruction) -> Trajectory:
 
 
 def write_keyframe_mesh(
-    reconstruction: Reconstruction, config: Config, path: Path, progress: ProgressCallback
+    reconstruction: Reconstruction,
+    config: Config,
+    path: Path,
+    progress: ProgressCallback,
+    *,
+    with_images: bool = True,
 ) -> tuple[MeshCounts | None, tuple[MeshImage, ...], tuple[str, ...]]:
     """Fuse the keyframes and write the mesh.
+
+    Args:
+        with_images: also render images of it.
 
     Returns:
         Its size, or None where there is no surface and no file; images of it; and notes.
@@ -69,7 +78,8 @@ def write_keyframe_mesh(
         return None, (), mesh.notes
     mesh.save(path)
     counts = MeshCounts(len(mesh.vertices_m), len(mesh.triangles))
-    return counts, render_mesh_images(mesh, reconstruction), mesh.notes
+    images = render_mesh_images(mesh, reconstruction) if with_images else ()
+    return counts, images, mesh.notes
 
 
 def judge_trajectory(
@@ -99,12 +109,19 @@ def judge_trajectory(
 
 
 def judge_health(
-    reconstruction: Reconstruction, steps: Sequence[StepResult], config: Config, *, is_measured: bool
+    reconstruction: Reconstruction,
+    steps: Sequence[StepResult],
+    config: Config,
+    scale: ScaleFacts,
+    *,
+    is_measured: bool,
 ) -> Health:
     """Whether the result can be trusted, by what the run knows of itself.
 
     Args:
+        reconstruction: the largest map, with the others.
         steps: one for each frame, in order.
+        scale: of the largest map.
         is_measured: a sensor measured the depth.
     """
     health = judge_run(
@@ -115,6 +132,8 @@ def judge_health(
             reconstruction.statistics,
             is_measured,
             config.tracking.min_inliers,
+            tuple(MapFacts(one.trajectory, one.points_m, one.statistics) for one in reconstruction.others),
+            scale_is_known=scale.uncertainty_log is not None,
         )
     )
     logger.info("verdict: %s. %s", health.verdict.value, health.headline)

@@ -7,7 +7,7 @@ import logging
 import random
 import sys
 import threading
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from logging.handlers import MemoryHandler
 from pathlib import Path
 
@@ -21,9 +21,9 @@ from slamdepth.depth.registry import create_depth_model
 from slamdepth.depth.scale_file import write_scale
 from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.frontend.features import feature_weights
-from slamdepth.io import write_text, write_tum_trajectory
-from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.pipeline.folder import FILES, RunFolder, run_log, write_log_to
+from slamdepth.io import write_text
+from slamdepth.pipeline.folder import FILES, MAPS, MAPS_CONTENT, RunFolder, run_log, write_log_to
+from slamdepth.pipeline.maps import finish_others, settle_others, write_mesh, write_trajectories
 from slamdepth.pipeline.options import (
     ProgressCallback,
     RunOptions,
@@ -36,16 +36,10 @@ from slamdepth.pipeline.prediction_scale import (
     check_scale_options,
     choose_prediction_scale,
 )
-from slamdepth.pipeline.results import (
-    judge_health,
-    judge_trajectory,
-    keyframe_trajectory,
-    score_depth,
-    write_keyframe_mesh,
-)
+from slamdepth.pipeline.results import judge_health, judge_trajectory, score_depth
 from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.tracking import AnyTracker, Tracked, track
-from slamdepth.report import MeshCounts, MeshImage, ReportData, write_mesh_png, write_report
+from slamdepth.report import MeshCounts, MeshImage, ReportData, write_report
 
 logger = logging.getLogger(__name__)
 
@@ -214,65 +208,57 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     """Everything after tracking; the trajectory first, since it is what was asked for."""
     config, dataset, folder, scale = job.config, job.dataset, job.folder, job.scale
     reconstruction, scale_facts, scale_notes = settle_scale(dataset, tracked.reconstruction, scale, config)
-    write_tum_trajectory(folder / "trajectory.txt", reconstruction.trajectory)
-    write_tum_trajectory(folder / "keyframes.txt", keyframe_trajectory(reconstruction))
-    notes = [*dataset.notes, *tracked.notes, *scale_notes]
-    mesh, mesh_images, mesh_notes = _mesh(job, reconstruction, tell)
+    others, other_notes = settle_others(dataset, tracked.reconstruction, scale, config)
+    reconstruction = replace(reconstruction, others=tuple(one.reconstruction for one in others))
+    write_trajectories(folder, (reconstruction, *reconstruction.others))
+    notes = [*dataset.notes, *tracked.notes, *scale_notes, *other_notes]
+    mesh: MeshCounts | None = None
+    mesh_images: tuple[MeshImage, ...] = ()
+    if job.options.mesh:
+        mesh, mesh_images, mesh_notes = write_mesh(folder, 1, reconstruction, config, tell)
+        notes += mesh_notes
+    is_measured = job.depth_is_measured
+    others, other_notes = finish_others(
+        dataset, others, config, folder, tell, mesh=job.options.mesh, is_measured=is_measured
+    )
+    notes += other_notes
 
     tell(RunProgress(RunStage.SCORING))
     trajectory_score, score_notes = judge_trajectory(
-        dataset, reconstruction.trajectory, is_measured=job.depth_is_measured
+        dataset, reconstruction.trajectory, is_measured=is_measured
     )
     depth_score, depth_notes = score_depth(dataset, reconstruction.keyframes)
     optional = (("mesh.ply", mesh), ("mesh.png", mesh_images), ("depth_scale.yaml", scale.fit))
     absent = {name for name, is_there in optional if not is_there}
+    files = {name: what for name, what in FILES.items() if name not in absent}
     summary = write_report(
         folder.path,
         ReportData(
             sequence=dataset.name,
             depth_model=job.model.name,
-            depth_is_measured=job.depth_is_measured,
+            depth_is_measured=is_measured,
             reconstruction=reconstruction,
             fps=tracked.fps,
             config=config,
             scale=scale_facts,
-            health=judge_health(reconstruction, tracked.steps, config, is_measured=job.depth_is_measured),
+            health=judge_health(reconstruction, tracked.steps, config, scale_facts, is_measured=is_measured),
             weights=(*job.model.weights, *feature_weights(config.features)),
             steps=tracked.steps,
             trajectory_score=trajectory_score,
             depth_score=depth_score,
             mesh=mesh,
+            others=others,
             mesh_images=mesh_images,
             skipped_frames=tracked.skipped,
             readable_frames=len(dataset),
             promised_frames=getattr(dataset, "frames_promised", len(dataset)),
-            notes=(*notes, *mesh_notes, *score_notes, *depth_notes),
+            notes=(*notes, *score_notes, *depth_notes),
             options=_reported_options(job.options, tracked),
-            files={name: what for name, what in FILES.items() if name not in absent},
+            files={**files, MAPS: MAPS_CONTENT} if others else files,
         ),
     )
     logger.info("done: %s", folder.path)
     return RunResult(folder.path, summary, reconstruction, tracked.interrupted)
-
-
-def _mesh(
-    job: _Job, reconstruction: Reconstruction, tell: ProgressCallback
-) -> tuple[MeshCounts | None, tuple[MeshImage, ...], tuple[str, ...]]:
-    """Write ``mesh.ply`` and ``mesh.png`` where a mesh was asked for; trouble becomes a note."""
-    if not job.options.mesh:
-        return None, (), ()
-    tell(RunProgress(RunStage.MESHING))
-    mesh: MeshCounts | None = None
-    images: tuple[MeshImage, ...] = ()
-    try:
-        mesh, images, notes = write_keyframe_mesh(reconstruction, job.config, job.folder / "mesh.ply", tell)
-    except SlamdepthError as error:
-        notes = (f"no mesh: {error}",)
-    for note in notes:
-        logger.warning("%s", note)
-    if images:
-        write_mesh_png(job.folder / "mesh.png", images)
-    return mesh, images, notes
 
 
 def seed_everything(seed: int) -> None:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""After tracking: the final scale of the map, and one sentence about it.
+"""After tracking: the final scale of each map, and one sentence about it.
 
-The whole map may be rescaled: by known sizes, combined with the scale that the depth gave the
-map, or, where that is asked for, by the scale of the ground truth's trajectory.
+The largest map may be rescaled: by known sizes, combined with the scale that the depth gave the map, or,
+where that is asked for, by the scale of the ground truth's trajectory. Maps that never met it have no part
+in these: their scale is what their own depth gave them.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _NO_CLAIM = "the scale was taken from ground truth: SE(3) ATE is not a metric cl
 def settle_scale(
     dataset: Dataset, reconstruction: Reconstruction, before: PredictionScale, config: Config
 ) -> tuple[Reconstruction, ScaleFacts, tuple[str, ...]]:
-    """Settle the scale of a finished map.
+    """Settle the scale of the largest map; ``others`` stay as they are.
 
     Args:
         reconstruction: as the tracker returned it.
@@ -47,9 +48,7 @@ def settle_scale(
     Returns:
         The reconstruction at its final scale, the facts about that scale, and notes on what failed.
     """
-    votes = reconstruction.statistics.scale_votes
-    spread = float(np.std(votes)) if votes else None
-    own, own_sentence, own_notes = _own_scale(dataset, reconstruction, before, spread)
+    own, own_sentence, own_notes = _own_scale(dataset, reconstruction, before, _spread(reconstruction))
     known, notes = _known_sizes(dataset, reconstruction, before, config)
     notes += own_notes
     verdict = _verdict(before, own, own_sentence, known)
@@ -57,27 +56,73 @@ def settle_scale(
     sentence = "; ".join([verdict.sentence, *notes, *claim])
     if known and not before.wants_trajectory:
         notes += _disagreements(own, known)
-    is_unknown = before.source is ScaleSource.VALUE and not known
-    shifted = before.scale if before.scale is not None and before.scale.shift else None
-    facts = ScaleFacts(
-        source=verdict.estimate.source,
-        factor=before.prediction_factor * verdict.estimate.factor,
-        sentence=sentence,
-        uncertainty_log=None if is_unknown else verdict.estimate.sigma_log,
-        keyframes=len(votes),
-        spread=spread,
-        prediction_factor=before.prediction_factor,
-        shift=None if shifted is None else shifted.shift,
-        shift_unit=None if shifted is None else shifted.domain.shift_unit,
-        from_ground_truth=verdict.from_ground_truth,
-        parts=verdict.parts,
-    )
+    facts = _facts(reconstruction, before, verdict, sentence, is_known=bool(known))
     logger.info("scale: %s", sentence)
     for note in notes:
         logger.warning("%s", note)
     if verdict.estimate.factor != 1.0:
         reconstruction = rescaled(reconstruction, verdict.estimate.factor)
     return reconstruction, facts, tuple(notes)
+
+
+def scale_of_other(
+    dataset: Dataset, other: Reconstruction, before: PredictionScale, config: Config
+) -> tuple[Reconstruction, ScaleFacts, tuple[str, ...]]:
+    """Settle the scale of a map that never met the largest one, by its own depth alone.
+
+    A factor on predictions is in its depth already. A known size and the ground truth's trajectory belong to
+    the largest map.
+
+    Args:
+        other: as the tracker returned it.
+        before: what was applied to the predictions it was made of.
+
+    Returns:
+        The map at its final scale, the facts about that scale, and notes on what failed.
+    """
+    own, sentence, notes = _own_scale(dataset, other, before, _spread(other))
+    asked = (config.scale.camera_height_m, config.scale.baseline_m)
+    if before.wants_trajectory or any(length_m is not None for length_m in asked):
+        sentence += "; what was given to scale the largest map by says nothing of this one"
+    facts = _facts(other, before, _Verdict(own, sentence, before.from_ground_truth), sentence, is_known=False)
+    return rescaled(other, own.factor) if own.factor != 1.0 else other, facts, tuple(notes)
+
+
+def _spread(reconstruction: Reconstruction) -> float | None:
+    """Standard deviation of the keyframes' votes, None without votes."""
+    votes = reconstruction.statistics.scale_votes
+    return float(np.std(votes)) if votes else None
+
+
+def _facts(
+    reconstruction: Reconstruction,
+    before: PredictionScale,
+    verdict: _Verdict,
+    sentence: str,
+    *,
+    is_known: bool,
+) -> ScaleFacts:
+    """What the report says of the scale.
+
+    Args:
+        reconstruction: before it was rescaled.
+        is_known: a known size or the ground truth's trajectory took part.
+    """
+    shifted = before.scale if before.scale is not None and before.scale.shift else None
+    is_unknown = before.source is ScaleSource.VALUE and not is_known
+    return ScaleFacts(
+        source=verdict.estimate.source,
+        factor=before.prediction_factor * verdict.estimate.factor,
+        sentence=sentence,
+        uncertainty_log=None if is_unknown else verdict.estimate.sigma_log,
+        keyframes=len(reconstruction.statistics.scale_votes),
+        spread=_spread(reconstruction),
+        prediction_factor=before.prediction_factor,
+        shift=None if shifted is None else shifted.shift,
+        shift_unit=None if shifted is None else shifted.domain.shift_unit,
+        from_ground_truth=verdict.from_ground_truth,
+        parts=verdict.parts,
+    )
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from slamdepth.report.console import run_table, scale_table, trajectory_table
-from slamdepth.report.data import MeshCounts, ReportData
+from slamdepth.report.data import MapData, MeshCounts, ReportData
 from slamdepth.report.html import build_html
 from slamdepth.report.mesh_images import MeshImage, render_mesh_images, write_mesh_png
 from slamdepth.report.scale import ScaleFacts, ScalePart, ScaleSource
@@ -12,6 +12,7 @@ from slamdepth.report.summary import build_summary
 from slamdepth.report.write import write_report
 
 __all__ = [
+    "MapData",
     "MeshCounts",
     "MeshImage",
     "ReportData",

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,26 @@ class View:
     def flat(self, points: Floats) -> Floats:
         """``points (N, 3)`` of the world as ``(N, 2)`` metres to the right and upwards."""
         return np.asarray(points @ np.stack([self.across, self.up], axis=1))
+
+    def frame(self, panel: Any, points: Floats, title: str | None = None) -> None:
+        """Give a plot of this view its title, equal scales, and limits a little wider than the points.
+
+        Args:
+            panel: matplotlib axes.
+            points: ``(N, 2)`` of :meth:`flat`; NaN where a line is broken.
+            title: None takes that of the view.
+        """
+        from matplotlib.ticker import MaxNLocator
+
+        points = points[np.isfinite(points).all(axis=1)]
+        low, high = points.min(axis=0), points.max(axis=0)
+        half = max(0.55 * float((high - low).max()), 0.01)
+        x, y = (low + high) / 2
+        panel.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+        panel.set(title=title or self.title, xlabel=self.labels[0], ylabel=self.labels[1])
+        panel.set_aspect("equal", adjustable="box")
+        panel.xaxis.set_major_locator(MaxNLocator(6))
+        panel.yaxis.set_major_locator(MaxNLocator(6))
 
 
 def drawing_views(gravity_w: Floats | None) -> tuple[View, View]:

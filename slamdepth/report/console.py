@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from slamdepth.evaluation import Verdict
+from slamdepth.report.maps import about_maps, map_lines
 from slamdepth.report.text import MISSING, count, fixed, percent
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ def run_table(summary: dict[str, Any]) -> Table:
     rows = [
         *_health_rows(summary["health"]),
         *_frame_rows(summary),
+        *_map_rows(summary),
         ("frames per second", fixed(summary["fps"], 1)),
         ("keyframes", count(summary["keyframes"])),
         ("loop closures", count(summary["loop_closures"])),
@@ -54,6 +56,9 @@ def _frame_rows(summary: dict[str, Any]) -> Rows:
     """Frames and tracked frames; where images could not be read, also the share of all images."""
     frames, tracked, unread = summary["frames"], summary["tracked"], summary["skipped_frames"]
     placed = f"{count(tracked)} ({percent(summary['tracked_fraction'])})"
+    in_all = summary["tracked_in_all_maps"]
+    if in_all != tracked:
+        placed += f" in the largest map, {count(in_all)} ({percent(in_all / frames)}) in all maps"
     readable, all_promised = summary["readable_frames"], summary["promised_frames"]
     promised = ""
     if all_promised != readable:
@@ -65,6 +70,15 @@ def _frame_rows(summary: dict[str, Any]) -> Rows:
         ("frames", f"{count(frames)} of {count(images)} images; {count(unread)} could not be read{promised}"),
         ("tracked", f"{placed}; {percent(tracked / images)} of all {count(images)} images"),
     ]
+
+
+def _map_rows(summary: dict[str, Any]) -> Rows:
+    """The maps of a run that ended in several, or joined some."""
+    maps = summary["maps"]
+    about = about_maps(len(maps), summary["maps_joined"])
+    if about is None:
+        return []
+    return [("maps", about), *(map_lines(maps) if len(maps) > 1 else [])]
 
 
 def trajectory_table(figures: dict[str, Any], title: str = "trajectory", digits: int = 6) -> Table:

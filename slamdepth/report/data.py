@@ -22,6 +22,22 @@ class MeshCounts:
 
 
 @dataclass(frozen=True)
+class MapData:
+    """One of several maps of a run, which have no common frame and no common scale.
+
+    Attributes:
+        reconstruction: at its final scale.
+        scale: is it metric, and how was its scale found.
+        trajectory_score, mesh: None where there is none.
+    """
+
+    reconstruction: Reconstruction
+    scale: ScaleFacts
+    trajectory_score: TrajectoryScore | None = None
+    mesh: MeshCounts | None = None
+
+
+@dataclass(frozen=True)
 class ReportData:
     """Everything the report of one run states.
 
@@ -29,14 +45,15 @@ class ReportData:
         sequence: name of the sequence, not its path.
         depth_model: name of the depth model.
         depth_is_measured: True where a sensor measured the depth rather than a network predicted it.
-        reconstruction: what the tracker returned.
+        reconstruction: the largest map at its final scale.
         fps: frames over the wall time of tracking, without meshing.
         config: every setting of the run.
-        scale: is the map metric, and how was its scale found.
+        scale: is the largest map metric, and how was its scale found.
         health: can the result be trusted, where not, and why.
         weights: every weights file that took part, and the data each has seen.
         steps: one result for each frame, in order; empty where they were not kept.
-        trajectory_score, depth_score, mesh: None where there is none.
+        trajectory_score, depth_score, mesh: of the largest map; None where there is none.
+        others: the maps that never met the largest one, the largest first.
         mesh_images: views of the mesh; empty where there is none.
         skipped_frames: images that could not be read: damaged, or missing.
         readable_frames, promised_frames: of the whole sequence, and as the header of a video says; None where
@@ -59,6 +76,7 @@ class ReportData:
     trajectory_score: TrajectoryScore | None = None
     depth_score: DepthScore | None = None
     mesh: MeshCounts | None = None
+    others: tuple[MapData, ...] = ()
     mesh_images: tuple[MeshImage, ...] = ()
     skipped_frames: int = 0
     readable_frames: int | None = None
@@ -66,3 +84,9 @@ class ReportData:
     notes: tuple[str, ...] = ()
     options: dict[str, object] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def maps(self) -> tuple[MapData, ...]:
+        """Every map of the run, the largest first."""
+        largest = MapData(self.reconstruction, self.scale, self.trajectory_score, self.mesh)
+        return (largest, *self.others)

@@ -9,6 +9,7 @@ from slamdepth.report import plots
 from slamdepth.report.axes import about_views
 from slamdepth.report.data import ReportData
 from slamdepth.report.keyframe_images import NEAR_TO_FAR, UNKNOWN, jpeg_address, keyframe_gallery
+from slamdepth.report.maps import MAP_HEADS, about_maps, map_rows, maps_plot
 from slamdepth.report.page import render
 from slamdepth.report.speed import speed_caption, speed_plot, stage_times
 from slamdepth.report.text import MISSING, count, fixed
@@ -30,6 +31,9 @@ def build_html(data: ReportData, summary: dict[str, Any]) -> str:
         charts=_charts(data, summary),
         notes=_notes(summary),
         span_rows=_span_rows(summary["health"]),
+        map_heads=MAP_HEADS,
+        map_rows=map_rows(summary["maps"]),
+        about_maps=about_maps(len(summary["maps"]), summary["maps_joined"]),
         axes=about_views(run.gravity_w),
         absolute_rows=_absolute_rows(summary["ate"]),
         relative_rows=_relative_rows(summary["rpe"]),
@@ -64,6 +68,7 @@ def _charts(data: ReportData, summary: dict[str, Any]) -> dict[str, str | None]:
         "tracking": plots.tracking_plot(data.steps),
         "scale": plots.scale_plot(run.keyframes),
         "map": plots.map_plot(run),
+        "maps": maps_plot(data.maps),
         "speed": speed_plot(times),
     }
 

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slamdepth.geometry import invert, transform
 from slamdepth.report import figure as fig
 from slamdepth.report.axes import drawing_views
-from slamdepth.report.gaps import gap_ends
+from slamdepth.report.gaps import gap_ends, with_gaps
 from slamdepth.types import TrackingStatus
 from slamdepth.typing import Floats
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from slamdepth.evaluation import RelativeError, TrajectoryScore
     from slamdepth.mapping.keyframe import Keyframe
     from slamdepth.mapping.reconstruction import Reconstruction
-    from slamdepth.report.axes import View
     from slamdepth.types import StepResult
 
 
@@ -43,16 +42,16 @@ def trajectory_plot(run: Reconstruction, score: TrajectoryScore | None) -> str |
     if len(run.trajectory) == 0:
         return None
     path = run.trajectory.T_world_camera[:, :3, 3]
-    lines = [(_with_gaps(run.trajectory.timestamps_s, path), fig.ESTIMATE, "-", "estimate")]
+    lines = [(with_gaps(run.trajectory.timestamps_s, path), fig.ESTIMATE, "-", "estimate")]
     links: Floats | None = None
     if score is not None:
         T_estimate_truth = invert(score.se3.T_truth_estimate)
         truth = transform(T_estimate_truth, score.truth_m)
-        lines.insert(0, (_with_gaps(score.timestamps_s, truth), fig.TRUTH, "-", "ground truth"))
+        lines.insert(0, (with_gaps(score.timestamps_s, truth), fig.TRUTH, "-", "ground truth"))
         if abs(score.sim3.scale - 1) > 0.02:
             scaled = transform(T_estimate_truth @ score.sim3.T_truth_estimate, score.estimate_m)
             label = f"estimate × {score.sim3.scale:.3f}"
-            lines.append((_with_gaps(score.timestamps_s, scaled), fig.SCALED, "--", label))
+            lines.append((with_gaps(score.timestamps_s, scaled), fig.SCALED, "--", label))
         step = max(1, score.matched // 150)
         ends = np.stack([truth, score.estimate_m, np.full_like(truth, np.nan)], axis=1)[::step]
         links = ends.reshape(-1, 3)
@@ -66,7 +65,7 @@ def trajectory_plot(run: Reconstruction, score: TrajectoryScore | None) -> str |
             for positions, colour, style, label in lines:
                 panel.plot(*view.flat(positions).T, style, color=colour, label=label)
             panel.plot(*view.flat(path[:1]).T, "o", color=fig.INK, ms=4, label="start")
-            _frame(panel, view, view.flat(np.concatenate([line[0] for line in lines])))
+            view.frame(panel, view.flat(np.concatenate([line[0] for line in lines])))
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
         return fig.to_svg(figure, f"Trajectory: {views[0].title}, {views[1].title}")
@@ -81,7 +80,7 @@ def map_plot(run: Reconstruction) -> str | None:
     low, high = np.percentile(cloud, (1, 99), axis=0)
     near = cloud[np.all((cloud >= low) & (cloud <= high), axis=1)]
     path = run.trajectory.T_world_camera[:, :3, 3]
-    broken = _with_gaps(run.trajectory.timestamps_s, path)
+    broken = with_gaps(run.trajectory.timestamps_s, path)
     positions = np.array([keyframe.T_world_camera[:3, 3] for keyframe in run.keyframes]).reshape(-1, 3)
     views = drawing_views(run.gravity_w)
     with fig.styled("map"):
@@ -90,7 +89,7 @@ def map_plot(run: Reconstruction) -> str | None:
             panel.plot(*view.flat(cloud).T, ".", color=_CLOUD, ms=2.2, alpha=0.6, mew=0, rasterized=True)
             panel.plot(*view.flat(broken).T, color=fig.ESTIMATE)
             panel.plot(*view.flat(positions).T, "o", color=fig.ESTIMATE, ms=2.2)
-            _frame(panel, view, view.flat(np.concatenate([near, path])))
+            view.frame(panel, view.flat(np.concatenate([near, path])))
         return fig.to_svg(figure, f"Sparse map: {views[0].title}, {views[1].title}")
 
 
@@ -135,7 +134,7 @@ def ate_plot(score: TrajectoryScore | None) -> str | None:
         figure, axes = fig.new_figure(_WIDTH, 2.6)
         panel = axes[0, 0]
         for error, colour, name in ((score.se3, fig.ESTIMATE, "SE(3)"), (score.sim3, fig.SCALED, "Sim(3)")):
-            values = _with_gaps(score.timestamps_s, 100 * error.errors_m[:, None])
+            values = with_gaps(score.timestamps_s, 100 * error.errors_m[:, None])
             label = f"{name}, RMSE {100 * error.rmse_m:.2f} cm"
             panel.plot(_gap_times(score.timestamps_s), values[:, 0], color=colour, label=label)
             panel.axhline(100 * error.rmse_m, color=colour, lw=0.8, ls=":")
@@ -159,7 +158,7 @@ def rpe_plot(score: TrajectoryScore | None) -> str | None:
         )
         for panel, name, values, rmse, unit in panels:
             x = _gap_times(times, score.timestamps_s[0])
-            panel.plot(x, _with_gaps(times, values[:, None])[:, 0], color=fig.ESTIMATE)
+            panel.plot(x, with_gaps(times, values[:, None])[:, 0], color=fig.ESTIMATE)
             panel.axhline(rmse, color=fig.ESTIMATE, lw=0.8, ls=":", label=f"RMSE {rmse:.2f} {unit}")
             panel.set(xlabel="time (s)", ylabel=f"error ({unit})", ylim=(0, None), title=f"{name} in {span}")
             fig.legend_above(panel)
@@ -181,7 +180,7 @@ def position_plot(run: Reconstruction, score: TrajectoryScore | None) -> str | N
         figure, axes = fig.new_figure(_WIDTH, 3.9, 3, 1, sharex=True)
         for axis, (panel, name) in enumerate(zip(axes[:, 0], names, strict=True)):
             for times, positions, colour, label in series:
-                values = _with_gaps(times, positions)
+                values = with_gaps(times, positions)
                 panel.plot(_gap_times(times, start_s), values[:, axis], color=colour, label=label)
             panel.set_ylabel(f"{name} (m)")
         fig.legend_above(axes[0, 0])
@@ -206,11 +205,6 @@ def scale_plot(keyframes: tuple[Keyframe, ...]) -> str | None:
         return fig.to_svg(figure, "Factor applied to the predicted depth of each keyframe")
 
 
-def _with_gaps(times: Floats, values: Floats) -> Floats:
-    """Rows ``values (N, D)`` with a row of NaN in each pause, so that no line bridges lost frames."""
-    return np.insert(values.astype(np.float64), gap_ends(times), np.nan, axis=0)
-
-
 def _gap_times(times: Floats, start_s: float | None = None) -> Floats:
     """Seconds since ``start_s`` (default: the first time) for the rows of :func:`_with_gaps`."""
     seconds = times - (times[0] if start_s is None else start_s)
@@ -221,18 +215,3 @@ def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """``(first, past the last)`` of each unbroken run of True."""
     changes = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(changes[::2], changes[1::2], strict=True)]
-
-
-def _frame(panel: Any, view: View, points: Floats) -> None:
-    """Titles, equal scales, and limits a little wider than the ``(N, 2)`` points."""
-    from matplotlib.ticker import MaxNLocator
-
-    points = points[np.isfinite(points).all(axis=1)]
-    low, high = points.min(axis=0), points.max(axis=0)
-    half = max(0.55 * float((high - low).max()), 0.01)
-    x, y = (low + high) / 2
-    panel.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
-    panel.set(title=view.title, xlabel=view.labels[0], ylabel=view.labels[1])
-    panel.set_aspect("equal", adjustable="box")
-    panel.xaxis.set_major_locator(MaxNLocator(6))
-    panel.yaxis.set_major_locator(MaxNLocator(6))

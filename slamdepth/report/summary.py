@@ -6,15 +6,20 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from slamdepth.evaluation import DepthScore, TrajectoryScore
+from slamdepth.evaluation import DepthScore
 from slamdepth.report.data import ReportData
 from slamdepth.report.environment import hardware, versions
+from slamdepth.report.maps import first_timestamp_s, map_figures, mesh_figures, trajectory_figures
 from slamdepth.report.shutter import shutter_facts
 
 
 def build_summary(data: ReportData) -> dict[str, Any]:
-    """The figures of a run, as nested plain values. Every key is always there; unknown values are None."""
+    """The figures of a run, as nested plain values. Every key is always there; unknown values are None.
+
+    Where the run ended in several maps, figures outside ``maps`` are those of the largest.
+    """
     run, statistics = data.reconstruction, data.reconstruction.statistics
+    maps = map_figures(data)
     return {
         "sequence": data.sequence,
         "health": data.health.to_dict(),
@@ -25,6 +30,8 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         "frames": statistics.frames,
         "tracked": statistics.tracked,
         "tracked_fraction": statistics.tracked / statistics.frames if statistics.frames else None,
+        "tracked_in_all_maps": statistics.tracked + sum(one["frames"] for one in maps[1:]),
+        "first_timestamp_s": first_timestamp_s(data),
         "skipped_frames": data.skipped_frames,
         "readable_frames": data.readable_frames,
         "promised_frames": data.promised_frames,
@@ -37,32 +44,17 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         "timings_ms": dict(statistics.timings_ms),
         "timing_calls": dict(statistics.timing_calls),
         "wall_s": statistics.frames / data.fps if data.fps > 0 else None,
-        **_trajectory(data.trajectory_score),
+        **trajectory_figures(data.trajectory_score),
         "depth": _depth(data.depth_score),
-        "mesh": {
-            "vertices": data.mesh.vertices if data.mesh else None,
-            "triangles": data.mesh.triangles if data.mesh else None,
-        },
+        "mesh": mesh_figures(data.maps[0]),
+        "maps": maps,
+        "maps_joined": statistics.maps_joined,
         "notes": [*data.notes, *run.notes],
         "weights": [asdict(weights) for weights in data.weights],
         "settings": data.config.for_report(),
         "options": dict(data.options),
         "versions": versions(),
         "hardware": hardware(),
-    }
-
-
-def _trajectory(score: TrajectoryScore | None) -> dict[str, Any]:
-    if score is not None:
-        return score.to_dict()
-    absolute = dict.fromkeys(("rmse_m", "mean_m", "median_m", "max_m"))
-    relative = dict.fromkeys(("trans_rmse_m", "rot_rmse_deg", "delta_frames"))
-    counts = dict.fromkeys(
-        ("matched_poses", "estimate_poses", "ground_truth_poses", "max_difference_s", "path_length_m")
-    )
-    return {
-        "ate": {"se3": absolute, "sim3": {**absolute, "scale": None}, **counts},
-        "rpe": {"per_frame": relative, "per_second": dict(relative)},
     }
 
 
