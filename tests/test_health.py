@@ -164,17 +164,63 @@ def test_a_keyframe_at_every_frame_of_a_video_is_a_doubt() -> None:
     assert judge_run(facts(walk(10), keyframe_every=1)).verdict is Verdict.GOOD
 
 
-def test_more_loops_refused_than_closed_are_a_doubt_and_a_few_are_none() -> None:
-    def with_loops(closed: int, refused: int, *, is_measured: bool = False) -> Verdict:
-        counts = RunStatistics(loop_closures=closed, loops_refused=refused)
-        return judge_run(facts(statistics=counts, depth_is_measured=is_measured)).verdict
+def with_loops(
+    closed: int, refused: int, *, inliers: int = 200, corrected_m: float = 0.0, weak_frames: int = 0
+) -> Health:
+    """A run of 1.5 m that refused loops; poses of its second half were first placed ``corrected_m`` away."""
+    counts = RunStatistics(loop_closures=closed, loops_refused=refused)
+    held = [inliers] * (COUNT - weak_frames) + [50] * weak_frames
+    known = facts(inliers=held, statistics=counts)
+    first = moved_from(walk(), COUNT // 2, corrected_m)
+    steps = [replace(step, T_world_camera=first[step.index]) for step in known.steps]
+    return judge_run(replace(known, steps=steps))
 
-    assert with_loops(closed=1, refused=20) is Verdict.DOUBTFUL
-    assert with_loops(closed=0, refused=3) is Verdict.DOUBTFUL
-    assert with_loops(closed=1, refused=20, is_measured=True) is Verdict.DOUBTFUL
-    assert with_loops(closed=0, refused=20, is_measured=True) is Verdict.GOOD
-    assert with_loops(closed=5, refused=4) is Verdict.GOOD
-    assert with_loops(closed=0, refused=1) is Verdict.GOOD
+
+def test_loops_refused_by_a_path_that_points_held_and_nothing_corrected_are_no_doubt() -> None:
+    health = with_loops(closed=0, refused=20)
+    assert health.verdict is Verdict.GOOD
+    assert "Places look alike here." in health.reasons[0]
+    assert health.maps[0].good_spans_s
+    assert with_loops(closed=1, refused=20, corrected_m=0.04).verdict is Verdict.GOOD
+
+
+def test_loops_refused_by_a_path_that_few_points_held_are_a_doubt() -> None:
+    health = with_loops(closed=0, refused=3, weak_frames=40)
+    assert health.numbers.weakest_second == 50
+    assert health.verdict is Verdict.DOUBTFUL
+    assert "few map points held it" in health.reasons[0]
+    assert health.maps[0].good_spans_s == ()
+    assert with_loops(closed=0, refused=3, weak_frames=10).verdict is Verdict.GOOD
+    assert with_loops(closed=0, refused=2, weak_frames=40).verdict is Verdict.GOOD
+    assert with_loops(closed=5, refused=4, weak_frames=40).verdict is Verdict.GOOD
+
+
+def test_loops_refused_by_a_path_that_was_corrected_far_are_a_doubt() -> None:
+    health = with_loops(closed=1, refused=3, corrected_m=0.5)
+    assert health.numbers.correction_share is not None
+    assert 0.08 < health.numbers.correction_share < 0.33
+    assert health.verdict is Verdict.DOUBTFUL
+    assert "moved the path by more than odometry drifts" in health.reasons[0]
+
+
+def test_poses_before_and_after_a_join_are_compared_in_frames_of_their_own() -> None:
+    known = facts()
+    poses = walk()
+    poses[: COUNT // 2, 0, 3] += 20.0  # the frame of a map that was joined later
+    steps = [
+        replace(step, T_world_camera=poses[step.index], map_id=int(step.index >= COUNT // 2))
+        for step in known.steps
+    ]
+    share = judge_run(replace(known, steps=steps)).numbers.correction_share
+    assert share is not None
+    assert share < 1e-6
+
+
+def test_a_recording_of_less_than_a_second_has_no_weakest_second() -> None:
+    assert judge_run(facts(walk(20))).numbers.weakest_second is None
+    assert judge_run(replace(facts(), steps=())).numbers.weakest_second is None
+    still = judge_run(facts(np.broadcast_to(np.eye(4), (COUNT, 4, 4)).copy()))
+    assert still.numbers.correction_share is None
 
 
 def test_keyframes_that_disagree_on_the_scale_are_a_doubt_and_an_outlier_is_none() -> None:
@@ -203,7 +249,7 @@ def test_no_path_is_not_to_be_trusted(placed: int, says: str) -> None:
 
 def test_the_gravest_reason_comes_first() -> None:
     lost = states(COUNT, (100, 200, TrackingStatus.LOST))
-    health = judge_run(facts(states=lost, statistics=RunStatistics(loops_refused=9)))
+    health = judge_run(facts(states=lost, statistics=RunStatistics(loops_refused=9), inliers=50))
     assert "lost" in health.reasons[0]
     assert "loops" in health.reasons[1]
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamdepth.evaluation.health_facts import RunFacts
+from slamdepth.evaluation.health_odometry import correction_share, weakest_second
 from slamdepth.evaluation.health_spans import HealthSpan, SpanKind
 from slamdepth.evaluation.leaps import judged_steps
 from slamdepth.types import StepResult, TrackingStatus
@@ -32,6 +33,10 @@ class HealthNumbers:
         frames_per_keyframe: frames of this map for each keyframe.
         loop_closures, loops_refused: loops that were closed, and verified ones that were not believed.
         scale_spread_log: robust standard deviation of the keyframes' votes on the map's scale.
+        weakest_second: smallest median of inliers over a second, see
+            :func:`slamdepth.evaluation.health_odometry.weakest_second`.
+        correction_share: how far a pose was moved after it was first placed, of the path's length, see
+            :func:`slamdepth.evaluation.health_odometry.correction_share`.
         maps: maps of the run that never met, this one included.
     """
 
@@ -49,6 +54,8 @@ class HealthNumbers:
     loop_closures: int
     loops_refused: int
     scale_spread_log: float | None
+    weakest_second: float | None
+    correction_share: float | None
     maps: int = 1
 
     @property
@@ -92,5 +99,7 @@ def measure_health(facts: RunFacts, spans: Sequence[HealthSpan], leaps: int) -> 
         loop_closures=run.loop_closures,
         loops_refused=run.loops_refused,
         scale_spread_log=1.4826 * float(np.median(np.abs(votes - np.median(votes)))) if len(votes) else None,
+        weakest_second=weakest_second(facts),
+        correction_share=correction_share(facts),
         maps=1 + len(facts.others),
     )

@@ -32,6 +32,8 @@ _MUCH_REGISTERED = 0.25
 _FRAMES_PER_KEYFRAME = 2.0
 _FEW_FRAMES = 20
 _FEW_REFUSED = 3
+_STRONG = 60  # points that hold odometry as well as it can be held: as in slamdepth/loops/edges.py
+_DRIFT_SHARE = 0.03  # of the path that odometry may drift by: as in slamdepth/loops/consistency.py
 _SCALE_SPREAD_LOG = 0.4  # a factor of 1.5; networks err by about 0.2 from image to image
 _SHOWN = 3  # spans named in one sentence
 
@@ -211,20 +213,28 @@ def _keyframe_rate(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Heal
 
 
 def _refused_loops(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
-    """Verified loops are wrong where places look alike, or right where the path has drifted.
+    """Verified loops that contradict the path are wrong where places look alike, right where it has drifted.
 
-    Either way more loops contradict the path than agree with it. A few refused loops are the normal case.
-    With measured depth the path drifts little, so that it is doubted only where loops have corrected it.
+    It can have drifted where a second was tracked by few points, and it has been led astray where it was
+    corrected by more than odometry drifts. Where neither is so, places look alike and the path is right. A
+    few refused loops are the normal case.
     """
     refused, closed = numbers.loops_refused, numbers.loop_closures
     if refused < _FEW_REFUSED or refused <= closed:
         return None
-    is_sure = facts.depth_is_measured and closed == 0
+    weakest, correction = numbers.weakest_second, numbers.correction_share
+    is_strong = weakest is not None and weakest >= _STRONG
+    is_steady = correction is not None and correction <= _DRIFT_SHARE
+    why = "Places look alike here."
+    if not is_strong:
+        why = "Either places look alike here, or the path has drifted where few map points held it."
+    elif not is_steady:
+        why = "Places look alike here, and loops or adjustment moved the path by more than odometry drifts"
+        why += "." if correction is None else f": by {percent(correction)} of its length."
     return Finding(
-        Verdict.GOOD if is_sure else Verdict.DOUBTFUL,
+        Verdict.GOOD if is_strong and is_steady else Verdict.DOUBTFUL,
         f"{refused} loops contradicted the path",
-        f"{refused} loops were refused because they contradict the path; loops closed: {closed}. Either "
-        "places look alike here, or the path has drifted.",
+        f"{refused} loops were refused because they contradict the path; loops closed: {closed}. {why}",
         is_local=False,
     )
 
