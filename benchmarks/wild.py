@@ -6,8 +6,10 @@
 
 Each run is a whole ``slamdepth run`` without a mesh, from frames 0, 10 and 20; the table has the medians.
 With --output, finished rows are kept and the same command goes on. The error is that of the largest map
-after alignment with scale; of a recording whose truth comes in pieces, that of the worst piece. A run is
-truly good where each piece is off by less than 2 % of its path or, in metres, by less than 5 cm.
+after alignment with scale; of a recording whose truth comes in pieces, that of the worst piece. A run, a
+map or a stretch of one is truly good where each piece is off by less than 2 % of its path or, in metres, by
+less than 5 cm. Stretches are those of five seconds and more that the report calls good: truly good ones, of
+all with true poses.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ from slamdepth.pipeline import RunProgress
 STARTS = (0, 10, 20)
 _KEYS = ("recording", "start")
 _HEADINGS = ("recording", "runs", "frames", "with a pose %", "largest map %", "maps", "Sim(3)", "% of extent",
-             "SE(3) m", "scale", "loops", "leaps", "truly good", "verdict", "wall s")  # fmt: skip
+             "SE(3) m", "scale", "loops", "leaps", "truly good", "verdict", "stretches", "wall s")  # fmt: skip
 
 
 def run_recording(
@@ -99,6 +101,8 @@ def medians(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     found["leaps"] = max((row["leaps"] for row in good), default=None)
     judged = [row["is_good"] for row in good if row["is_good"] is not None]
     found["good"] = f"{sum(judged)}/{len(judged)}" if judged else "-"
+    spans = [span["is_good"] for row in good for span in row["spans"] if span["is_good"] is not None]
+    found["spans"] = f"{sum(spans)}/{len(spans)}" if spans else "-"
     found["verdict"] = ", ".join(dict.fromkeys(row["verdict"] for row in good)) or "-"
     return found
 
@@ -112,12 +116,19 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def verdicts(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """For each verdict how many of the runs with known truth that got it are truly good."""
-    judged = [row for row in rows if "error" not in row and row["is_good"] is not None]
+    """For each verdict how many of the runs, of the maps and of the stretches that got it are truly good.
+
+    What has no known truth is not counted.
+    """
+    done = [row for row in rows if "error" not in row]
+    spans = [{**span, "verdict": "good"} for row in done for span in row["spans"]]
+    several = [one for row in done if len(row["each_map"]) > 1 for one in row["each_map"]]
     lines = []
-    for name in sorted({row["verdict"] for row in judged} - {"-"}):
-        good = [row["is_good"] for row in judged if row["verdict"] == name]
-        lines.append(f"verdict '{name}': {sum(good)} of {len(good)} runs are truly good")
+    for what, ones in (("runs", done), ("maps of runs in several", several), ("stretches", spans)):
+        known = [one for one in ones if one["is_good"] is not None]
+        for name in sorted({one["verdict"] for one in known} - {"-"}):
+            good = [one["is_good"] for one in known if one["verdict"] == name]
+            lines.append(f"verdict '{name}': {sum(good)} of {len(good)} {what} are truly good")
     return lines
 
 
@@ -132,7 +143,7 @@ def _cells(m: dict[str, Any]) -> list[str]:
         shown("largest", ".1f", 100), shown("maps", ".0f"), shown("sim3", ".4f"),
         shown("sim3_percent", ".1f"), shown("se3_m", ".3f"),
         shown("scale", ".3f"), shown("loops", ".0f"), shown("leaps", ".0f"), m["good"], m["verdict"],
-        shown("wall_s", ".0f"),
+        m["spans"], shown("wall_s", ".0f"),
     ]  # fmt: skip
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of one finished run on a recording: what was placed, how well, and what leaps."""
+"""Figures of one finished run on a recording: what was placed, how well, what leaps, what is called good."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from slamdepth.errors import DatasetError
 from slamdepth.evaluation import score_trajectory
+from slamdepth.evaluation.health_spans import GOOD_SPAN_S
 from slamdepth.io import read_tum_trajectory
 from slamdepth.types import Trajectory
 
@@ -23,7 +24,8 @@ GOOD_SHARE, GOOD_M = 0.02, 0.05
 
 def read_maps(folder: Path) -> list[Trajectory]:
     """The trajectory of each map of a run folder, the largest first."""
-    files = [folder / "trajectory.txt", *sorted(folder.glob("maps/*/trajectory.txt"))]
+    others = sorted(folder.glob("maps/*/trajectory.txt"), key=lambda file: int(file.parent.name))
+    files = [folder / "trajectory.txt", *others]
     return [read_tum_trajectory(file)[0] for file in files if file.is_file()]
 
 
@@ -57,6 +59,50 @@ def score_piece(truth: Trajectory, estimate: Trajectory, *, is_metric: bool) -> 
     }
 
 
+def score_map(truths: Sequence[Trajectory], estimate: Trajectory, *, is_metric: bool) -> dict[str, Any]:
+    """The errors of one map: its pieces of true poses, those that could be scored, and the worst of them.
+
+    ``is_good`` is None where none could be scored.
+    """
+    pieces = [score_piece(truth, estimate, is_metric=is_metric) for truth in truths]
+    scored = [piece for piece in pieces if "error" not in piece]
+    worst = max(scored, key=lambda piece: float(piece["sim3"]), default={})
+    return {
+        "pieces": pieces,
+        "worst": worst,
+        "is_good": all(piece["is_good"] for piece in scored) if scored else None,
+    }
+
+
+def score_spans(
+    summary: dict[str, Any], maps: Sequence[Trajectory], truths: Sequence[Trajectory], *, is_metric: bool
+) -> list[dict[str, Any]]:
+    """The stretches that a run calls good, and whether they are.
+
+    ``is_good`` is None where less than five seconds of a stretch have true poses, or the camera stood still.
+    """
+    found = []
+    judged = summary.get("health", {}).get("maps", [])
+    for number, (health, estimate) in enumerate(zip(judged, maps, strict=False), start=1):
+        times_s = estimate.timestamps_s - summary["first_timestamp_s"]
+        for from_s, to_s in health["good_spans_s"]:
+            kept = (times_s >= from_s) & (times_s <= to_s)
+            part = Trajectory(estimate.timestamps_s[kept], estimate.T_world_camera[kept])
+            long = [truth for truth in truths if _overlap_s(truth, part) >= GOOD_SPAN_S]
+            score = score_map(long, part, is_metric=is_metric)
+            about = {"map": number, "from_s": from_s, "to_s": to_s, "is_good": score["is_good"]}
+            found.append({**about, "sim3": score["worst"].get("sim3"), "path": score["worst"].get("path")})
+    return found
+
+
+def _overlap_s(a: Trajectory, b: Trajectory) -> float:
+    """Seconds for which both have poses."""
+    if not len(a) or not len(b):
+        return 0.0
+    ends = min(a.timestamps_s[-1], b.timestamps_s[-1]), max(a.timestamps_s[0], b.timestamps_s[0])
+    return float(ends[0] - ends[1])
+
+
 def verdict(summary: dict[str, Any]) -> str:
     """What ``report.json`` says about itself under ``health``; "-" where it says nothing."""
     health = summary.get("health")
@@ -78,20 +124,32 @@ def figures(
         is_metric: whether they are in metres.
     """
     maps = read_maps(folder)
-    pieces = [score_piece(truth, maps[0], is_metric=is_metric) for truth in truths]
-    scored = [piece for piece in pieces if "error" not in piece]
-    worst = max(scored, key=lambda piece: float(piece["sim3"]), default={})
+    scores = [score_map(truths, one, is_metric=is_metric) for one in maps]
+    worst, pieces = scores[0]["worst"], scores[0]["pieces"]
+    verdicts = [one["verdict"] for one in summary.get("maps", [])]
     return {
         "frames": frames,
         "posed": len(set().union(*(one.timestamps_s.tolist() for one in maps))) / frames,
         "largest": len(maps[0]) / frames,
         "maps": len(maps),
         **{name: worst.get(name) for name in ("sim3", "sim3_percent", "se3_m", "scale")},
-        "is_good": all(piece["is_good"] for piece in scored) if scored else None,
+        "is_good": scores[0]["is_good"],
         "pieces": pieces if len(pieces) > 1 else [],
         "unscored": [piece["error"] for piece in pieces if "error" in piece],
         "loops": summary.get("loop_closures"),
+        "joined": summary.get("maps_joined"),
         "leaps": sum(map(count_leaps, maps)),
+        "each_map": [
+            {
+                "frames": len(one),
+                "sim3": score["worst"].get("sim3"),
+                "sim3_percent": score["worst"].get("sim3_percent"),
+                "is_good": score["is_good"],
+                "verdict": said,
+            }
+            for one, score, said in zip(maps, scores, verdicts, strict=False)
+        ],
+        "spans": score_spans(summary, maps, truths, is_metric=is_metric),
         "verdict": verdict(summary),
         "health": summary.get("health"),
     }

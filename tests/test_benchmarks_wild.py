@@ -16,7 +16,7 @@ from benchmarks.excerpt import readable_excerpts, write_excerpt
 from benchmarks.record import environment
 from benchmarks.resume import RowFile
 from benchmarks.wild_recordings import find_recordings
-from benchmarks.wild_scores import count_leaps, figures, score_piece, verdict
+from benchmarks.wild_scores import count_leaps, figures, read_maps, score_piece, score_spans, verdict
 from slamdepth.datasets import open_dataset
 from slamdepth.errors import DatasetError, InputError, OutputError
 from slamdepth.io import write_tum_trajectory
@@ -122,12 +122,48 @@ def test_the_verdict_is_that_of_the_report() -> None:
     assert verdict({"health": "good"}) == "good"
 
 
-def test_verdicts_are_compared_with_the_truth() -> None:
+def test_verdicts_on_runs_maps_and_stretches_are_compared_with_the_truth() -> None:
+    nothing: dict[str, Any] = {"spans": [], "each_map": []}
+    maps = [{"verdict": "good", "is_good": True}, {"verdict": "doubtful", "is_good": False}]
     rows: list[dict[str, Any]] = [
-        {"verdict": "good", "is_good": True}, {"verdict": "good", "is_good": False},
-        {"verdict": "bad", "is_good": None}, {"verdict": "-", "is_good": True}, {"error": "too dark"},
+        {"verdict": "good", "is_good": True, "each_map": maps,
+         "spans": [{"is_good": True}, {"is_good": None}]},
+        {"verdict": "good", "is_good": False, "each_map": maps[:1], "spans": [{"is_good": False}]},
+        {"verdict": "bad", "is_good": None, **nothing}, {"verdict": "-", "is_good": True, **nothing},
+        {"error": "too dark"},
     ]  # fmt: skip
-    assert wild.verdicts(rows) == ["verdict 'good': 1 of 2 runs are truly good"]
+    assert wild.verdicts(rows) == [
+        "verdict 'good': 1 of 2 runs are truly good",
+        "verdict 'doubtful': 0 of 1 maps of runs in several are truly good",
+        "verdict 'good': 1 of 1 maps of runs in several are truly good",
+        "verdict 'good': 1 of 2 stretches are truly good",
+    ]
+
+
+def test_a_stretch_is_scored_in_the_frame_of_its_own_map() -> None:
+    truth = along(np.linspace(0, 12, 200), 100.0)
+    bent = truth.T_world_camera.copy()
+    bent[100:, 2, 3] += np.linspace(0, 3, 100) ** 2
+    bent[:, 0, 3] += 7.0
+    maps = [Trajectory(truth.timestamps_s, bent), along(range(5), 300.0)]
+    stretches = [[0.0, 9.8], [10.0, 19.9]]
+    summary = {
+        "first_timestamp_s": 100.0,
+        "health": {"maps": [{"good_spans_s": stretches}, {"good_spans_s": [[200.0, 206.0]]}]},
+    }
+    spans = score_spans(summary, maps, [truth, along(range(30), 102.0)], is_metric=False)
+    assert [span["is_good"] for span in spans] == [True, False, None]
+    assert [span["map"] for span in spans] == [1, 1, 2]
+    assert spans[0]["path"] == pytest.approx(7.1, abs=0.1)
+    assert spans[0]["sim3"] < 1e-6 < spans[1]["sim3"]
+
+
+def test_maps_are_read_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    write_tum_trajectory(tmp_path / "trajectory.txt", along(range(20)))
+    for number in (10, 2):
+        (tmp_path / "maps" / str(number)).mkdir(parents=True)
+        write_tum_trajectory(tmp_path / "maps" / str(number) / "trajectory.txt", along(range(20 - number)))
+    assert [len(one) for one in read_maps(tmp_path)] == [20, 18, 10]
 
 
 def test_an_excerpt_is_the_rest_of_the_sequence(tmp_path: Path, tiny_room: Path) -> None:
