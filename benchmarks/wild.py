@@ -44,7 +44,8 @@ from slamdepth.pipeline import RunProgress
 STARTS = (0, 10, 20)
 _KEYS = ("recording", "start")
 _HEADINGS = ("recording", "runs", "frames", "with a pose %", "largest map %", "maps", "Sim(3)", "% of extent",
-             "SE(3) m", "scale", "loops", "leaps", "truly good", "verdict", "stretches", "wall s")  # fmt: skip
+             "SE(3) m", "scale", "loops", "leaps", "truly good", "verdict", "stretches",
+             "wall s")  # fmt: skip
 
 
 def run_recording(

@@ -44,6 +44,7 @@ def test_frames_in_a_map_that_never_met_the_largest_count_as_lost_ones_do(
     assert f"{round(100 * frames / COUNT)} % of the frames are in another map" in health.reasons[0]
     assert (health.numbers.maps, health.numbers.lost_share) == (2, 0.0)
     assert [one.verdict for one in health.maps] == [Verdict.GOOD, Verdict.GOOD]
+    assert all(one.reasons == () for one in health.maps)  # neither's own time has frames of the other
     if verdict is Verdict.GOOD:
         assert "97 % of the frames are in the largest of 2 maps" in health.headline
 

@@ -115,7 +115,7 @@ def _several_maps(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Healt
     A few frames of another place at the start or the end look the same, and leave the largest map as it is.
     """
     share = numbers.outside_share or 0.0
-    if not facts.others:
+    if not share:
         return None
     others = "another map" if len(facts.others) == 1 else f"{len(facts.others)} other maps"
     where = _where(spans, SpanKind.OTHER_MAP)
