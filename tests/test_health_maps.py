@@ -94,6 +94,14 @@ def test_withdrawn_poses_are_stated_and_many_are_a_doubt(frames: int, verdict: V
     assert "did not confirm" in health.reasons[0]
 
 
+def test_a_frame_that_was_placed_after_all_is_not_lost() -> None:
+    whole = facts()
+    late = [replace(step, status=TrackingStatus.LOST, T_world_camera=None) for step in whole.steps[100:120]]
+    health = judge_run(replace(whole, steps=[*whole.steps[:100], *late, *whole.steps[120:]]))
+    assert health.numbers.lost_share == 0.0
+    assert health.spans == ()
+
+
 def test_stretches_without_any_evidence_are_called_good() -> None:
     np.testing.assert_allclose(judge_run(facts()).maps[0].good_spans_s, [(0.0, 299 / FPS)], atol=1e-3)
     leap = judge_run(facts(moved_from(walk(600), 170, 1.0)))

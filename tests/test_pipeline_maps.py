@@ -96,6 +96,7 @@ def test_the_command_prints_a_line_for_each_map(
     assert "2 that never met: no common frame, each with its own scale" in done.stdout
     assert "map 1, the largest" in done.stdout
     assert "8 (33.3 %) frames" in done.stdout
+    assert f"{folder}/maps\n" in done.stdout
 
 
 def test_a_single_map_can_be_asked_for(tiny_room: Path, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _PLACES = {
     "results": "",
     "trajectory": "trajectory.txt",
+    "other maps": "maps",
     "mesh file": "mesh.ply",
     "report": "report.html",
 }

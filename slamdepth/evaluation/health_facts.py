@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from slamdepth.types import RunStatistics, StepResult, Trajectory
+from slamdepth.types import RunStatistics, StepResult, TrackingStatus, Trajectory
 from slamdepth.typing import Floats
 
 
@@ -79,10 +79,16 @@ class RunFacts:
         """Times of the frames in the other maps."""
         return frozenset(t for one in self.others for t in one.trajectory.timestamps_s.tolist())
 
+    def is_lost(self, step: StepResult) -> bool:
+        """Whether a frame was lost, and not placed afterwards."""
+        return step.status is TrackingStatus.LOST and not self._is_placed(step)
+
     def is_withdrawn(self, step: StepResult) -> bool:
         """Whether the pose that a step gave is in no map of the result."""
-        is_placed = step.timestamp_s in self.members or step.timestamp_s in self.elsewhere
-        return step.T_world_camera is not None and not is_placed
+        return step.T_world_camera is not None and not self._is_placed(step)
+
+    def _is_placed(self, step: StepResult) -> bool:
+        return step.timestamp_s in self.members or step.timestamp_s in self.elsewhere
 
     def of_each_map(self) -> list[RunFacts]:
         """What the run knows of each map, the judged one first: its frames from its first to its last."""

@@ -85,7 +85,7 @@ def measure_health(facts: RunFacts, spans: Sequence[HealthSpan], leaps: int) -> 
     return HealthNumbers(
         tracked_share=run.tracked / run.frames if run.frames else None,
         outside_share=share(lambda step: step.timestamp_s in facts.elsewhere),
-        lost_share=share(lambda step: step.status is TrackingStatus.LOST),
+        lost_share=share(facts.is_lost),
         withdrawn_share=share(facts.is_withdrawn),
         no_map_share=share(lambda step: step.status is TrackingStatus.INITIALISING),
         longest_loss_s=max((span.duration_s for span in spans if span.kind is SpanKind.LOST), default=0.0),

@@ -18,7 +18,6 @@ from slamdepth.evaluation.health_facts import RunFacts
 from slamdepth.evaluation.health_numbers import HealthNumbers
 from slamdepth.evaluation.health_spans import LONG_S, HealthSpan, SpanKind
 from slamdepth.evaluation.leaps import MAX_STEP_S
-from slamdepth.types import TrackingStatus
 
 WEAK = 2
 """Times the least inliers that the tracker accepts: one group of wrong matches less, and it would be lost."""
@@ -82,7 +81,7 @@ def _losses(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]
     if share < _SOME_LOST and numbers.longest_loss_s < LONG_S:
         return None
     where = _where(spans, SpanKind.LOST)
-    is_lost_at_the_end = bool(facts.steps) and facts.steps[-1].status is TrackingStatus.LOST
+    is_lost_at_the_end = bool(facts.steps) and facts.is_lost(facts.steps[-1])
     end = "it was not found again" if is_lost_at_the_end else "parts before and after may not fit together"
     return Finding(
         _level_of(share),

@@ -84,7 +84,7 @@ def find_spans(facts: RunFacts, leaps: Ints, weak_inliers: int) -> tuple[HealthS
 
     spans = [
         *_stretches(facts, _has(TrackingStatus.INITIALISING), SpanKind.NO_MAP, _no_map),
-        *_stretches(facts, _has(TrackingStatus.LOST), SpanKind.LOST, _lost),
+        *_stretches(facts, facts.is_lost, SpanKind.LOST, _lost),
         *_stretches(facts, facts.is_withdrawn, SpanKind.WITHDRAWN, _withdrawn),
         *_stretches(facts, is_elsewhere, SpanKind.OTHER_MAP, _elsewhere),
         *_stretches(facts, is_weak, SpanKind.WEAK, _weak, LONG_S),

@@ -101,8 +101,9 @@ class RunResult:
     Attributes:
         folder: the run folder; its ``README.txt`` explains each file.
         summary: the content of ``report.json``: counts, scores, versions, settings.
-        reconstruction: trajectory, keyframes and map points at their final scale, as they were written.
-            Images and depth of the keyframes stay in memory or in a temporary file as long as it is kept.
+        reconstruction: trajectory, keyframes and map points at their final scale, as they were written: the
+            largest map, and in ``others`` those that never met it. Images and depth of the keyframes stay in
+            memory or in a temporary file as long as it is kept.
         interrupted: True where the run was stopped before the last frame.
     """
 
@@ -113,7 +114,7 @@ class RunResult:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Every placed frame after optimisation, as in ``trajectory.txt``."""
+        """Every frame placed in the largest map, after optimisation, as in ``trajectory.txt``."""
         return self.reconstruction.trajectory
 
 
