@@ -13,7 +13,7 @@ from made_up_runs import COUNT, FPS, SCENE_M, facts, kinds, moved_from, states, 
 from slamdepth.evaluation import Health, SpanKind, Verdict, judge_run
 from slamdepth.evaluation.leaps import find_leaps, scene_distance
 from slamdepth.geometry import se3_exp
-from slamdepth.types import RunStatistics, TrackingStatus
+from slamdepth.types import RunStatistics, TrackingStatus, Trajectory
 
 
 def test_a_steady_path_is_good_and_says_so_in_one_line() -> None:
@@ -165,15 +165,18 @@ def test_a_keyframe_at_every_frame_of_a_video_is_a_doubt() -> None:
 
 
 def with_loops(
-    closed: int, refused: int, *, inliers: int = 200, corrected_m: float = 0.0, weak_frames: int = 0
+    closed: int, refused: int, *, corrected_m: float = 0.0, weak_frames: int = 0, withdrawn: int = 0
 ) -> Health:
     """A run of 1.5 m that refused loops; poses of its second half were first placed ``corrected_m`` away."""
     counts = RunStatistics(loop_closures=closed, loops_refused=refused)
-    held = [inliers] * (COUNT - weak_frames) + [50] * weak_frames
-    known = facts(inliers=held, statistics=counts)
+    held = [200] * (COUNT - weak_frames) + [50] * weak_frames
+    known = facts(inliers=held, statistics=counts, depth_is_measured=True)
+    path = known.trajectory
+    kept = np.r_[0:60, 60 + withdrawn : COUNT]
+    path = Trajectory(path.timestamps_s[kept], path.T_world_camera[kept])
     first = moved_from(walk(), COUNT // 2, corrected_m)
     steps = [replace(step, T_world_camera=first[step.index]) for step in known.steps]
-    return judge_run(replace(known, steps=steps))
+    return judge_run(replace(known, steps=steps, trajectory=path))
 
 
 def test_loops_refused_by_a_path_that_points_held_and_nothing_corrected_are_no_doubt() -> None:
@@ -182,6 +185,13 @@ def test_loops_refused_by_a_path_that_points_held_and_nothing_corrected_are_no_d
     assert "Places look alike here." in health.reasons[0]
     assert health.maps[0].good_spans_s
     assert with_loops(closed=1, refused=20, corrected_m=0.04).verdict is Verdict.GOOD
+
+
+def test_loops_refused_by_a_path_that_was_not_tracked_throughout_are_a_doubt() -> None:
+    health = with_loops(closed=0, refused=20, withdrawn=1)
+    assert health.verdict is Verdict.DOUBTFUL
+    assert "where tracking failed" in health.reasons[0]
+    assert with_loops(closed=0, refused=0, withdrawn=1).verdict is Verdict.GOOD
 
 
 def test_loops_refused_by_a_path_that_few_points_held_are_a_doubt() -> None:
@@ -200,7 +210,7 @@ def test_loops_refused_by_a_path_that_was_corrected_far_are_a_doubt() -> None:
     assert health.numbers.correction_share is not None
     assert 0.08 < health.numbers.correction_share < 0.33
     assert health.verdict is Verdict.DOUBTFUL
-    assert "moved the path by more than odometry drifts" in health.reasons[0]
+    assert "loops and adjustment moved it by" in health.reasons[0]
 
 
 def test_poses_before_and_after_a_join_are_compared_in_frames_of_their_own() -> None:

@@ -214,9 +214,9 @@ def _keyframe_rate(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Heal
 def _refused_loops(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
     """Verified loops that contradict the path are wrong where places look alike, right where it has drifted.
 
-    It can have drifted where a second was tracked by few points, and it has been led astray where it was
-    corrected by more than odometry drifts. Where neither is so, places look alike and the path is right. A
-    few refused loops are the normal case.
+    It can have drifted where few points held it for a second, or where tracking failed however shortly, and
+    it has been led astray where it was corrected by more than odometry drifts. Where none of this is so,
+    places look alike and the path is right. A few refused loops are normal.
     """
     refused, closed = numbers.loops_refused, numbers.loop_closures
     if refused < _FEW_REFUSED or refused <= closed:
@@ -224,16 +224,21 @@ def _refused_loops(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Heal
     weakest, correction = numbers.weakest_second, numbers.correction_share
     is_strong = weakest is not None and weakest >= _STRONG
     is_steady = correction is not None and correction <= _DRIFT_SHARE
-    why = "Places look alike here."
-    if not is_strong:
-        why = "Either places look alike here, or the path has drifted where few map points held it."
-    elif not is_steady:
-        why = "Places look alike here, and loops or adjustment moved the path by more than odometry drifts"
-        why += "." if correction is None else f": by {percent(correction)} of its length."
+    is_whole = not (numbers.leaps or numbers.withdrawn_share or numbers.lost_share)
+    is_sure = is_strong and is_steady and is_whole
+    why = "Either places look alike here, or the path has drifted"
+    if is_sure:
+        why = "Places look alike here"
+    elif not is_strong:
+        why += " where few map points held it"
+    elif correction is not None and not is_steady:
+        why += f"; loops and adjustment moved it by {percent(correction)} of its length"
+    elif not is_whole:
+        why += " where tracking failed"
     return Finding(
-        Verdict.GOOD if is_strong and is_steady else Verdict.DOUBTFUL,
+        Verdict.GOOD if is_sure else Verdict.DOUBTFUL,
         f"{refused} loops contradicted the path",
-        f"{refused} loops were refused because they contradict the path; loops closed: {closed}. {why}",
+        f"{refused} loops were refused because they contradict the path; loops closed: {closed}. {why}.",
         is_local=False,
     )
 
