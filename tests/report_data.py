@@ -93,7 +93,7 @@ def full_data() -> ReportData:
     states = [TrackingStatus.INITIALISING, *[TrackingStatus.TRACKING] * 29, *[TrackingStatus.LOST] * 10]
     states += [TrackingStatus.RELOCALISED, *[TrackingStatus.TRACKING] * 39]
     steps = tuple(
-        StepResult(i, 100.0 + i / 30, state, None, inliers=i, is_keyframe=i % 10 == 0)
+        StepResult(i, 100.0 + i / 30, state, None, inliers=100 + i, is_keyframe=i % 10 == 0)
         for i, state in enumerate(states)
     )
     run = Reconstruction(

@@ -43,8 +43,11 @@ def test_frames_in_a_map_that_never_met_the_largest_count_as_lost_ones_do(
     assert kinds(health) == [SpanKind.OTHER_MAP]
     assert f"{round(100 * frames / COUNT)} % of the frames are in another map" in health.reasons[0]
     assert (health.numbers.maps, health.numbers.lost_share) == (2, 0.0)
-    assert [one.verdict for one in health.maps] == [Verdict.GOOD, Verdict.GOOD]
-    assert all(one.reasons == () for one in health.maps)  # neither's own time has frames of the other
+    largest, other = health.maps
+    assert largest.verdict is Verdict.GOOD
+    assert largest.reasons == ()  # its own time has no frame of the other
+    assert other.verdict is Verdict.DOUBTFUL
+    assert "too short to judge" in other.headline
     if verdict is Verdict.GOOD:
         assert "97 % of the frames are in the largest of 2 maps" in health.headline
 
@@ -100,6 +103,32 @@ def test_a_frame_that_was_placed_after_all_is_not_lost() -> None:
     health = judge_run(replace(whole, steps=[*whole.steps[:100], *late, *whole.steps[120:]]))
     assert health.numbers.lost_share == 0.0
     assert health.spans == ()
+
+
+def test_a_map_of_five_seconds_is_judged_by_itself() -> None:
+    health = judge_run(with_other_map(COUNT, 2 * COUNT, 2 * COUNT))
+    assert [one.verdict for one in health.maps] == [Verdict.GOOD, Verdict.GOOD]
+    assert [len(one.good_spans_s) for one in health.maps] == [1, 1]
+
+
+def test_weak_frames_before_a_loss_are_not_bridged() -> None:
+    lost = states(COUNT, (200, 210, TrackingStatus.LOST))
+    held = [200] * 190 + [25] * 10 + [0] * 10 + [200] * 90
+    health = judge_run(facts(states=lost, inliers=held))
+    assert kinds(health) == [SpanKind.WEAK, SpanKind.LOST]
+    assert health.verdict is Verdict.GOOD  # ten frames are stated
+    assert "next to a loss" in health.reasons[0]
+    longer = [200] * 180 + [25] * 20 + [0] * 10 + [200] * 90
+    assert judge_run(facts(states=lost, inliers=longer)).verdict is Verdict.DOUBTFUL
+
+
+def test_few_points_and_depth_alone_by_turns_are_one_stretch() -> None:
+    mixed = states(COUNT, *((n, n + 5, TrackingStatus.REGISTERED) for n in range(100, 140, 10)))
+    held = [200] * 100 + [20] * 40 + [200] * 160
+    health = judge_run(facts(states=mixed, inliers=held))
+    assert kinds(health) == [SpanKind.WEAK]
+    assert health.spans[0].duration_s == pytest.approx(40 / FPS, abs=1e-3)
+    assert health.verdict is Verdict.DOUBTFUL
 
 
 def test_stretches_without_any_evidence_are_called_good() -> None:

@@ -55,7 +55,7 @@ def test_each_map_has_files_score_and_verdict_of_its_own(tiny_room: Path, tmp_pa
     assert all(one["ate"]["se3"]["rmse_m"] < 0.02 for one in summary["maps"])
     assert summary["maps"][1]["mesh"]["triangles"] > 0
     assert summary["health"]["verdict"] == "not trustworthy"
-    assert [one["verdict"] for one in summary["health"]["maps"]] == ["good", "good"]
+    assert all("too short to judge" in one["headline"] for one in summary["health"]["maps"])
     readme = (folder / "README.txt").read_text()
     assert "each map that never met the largest" in readme
     assert "maps/" in (folder / "report.html").read_text(encoding="utf-8")

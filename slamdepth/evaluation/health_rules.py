@@ -16,7 +16,7 @@ import numpy as np
 
 from slamdepth.evaluation.health_facts import RunFacts
 from slamdepth.evaluation.health_numbers import HealthNumbers
-from slamdepth.evaluation.health_spans import LONG_S, HealthSpan, SpanKind
+from slamdepth.evaluation.health_spans import GOOD_SPAN_S, LONG_S, HealthSpan, SpanKind
 from slamdepth.evaluation.leaps import MAX_STEP_S
 
 WEAK = 2
@@ -148,17 +148,19 @@ def _leaps(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan])
 def _weak_tracking(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
     """With few inliers one group of wrong matches decides the pose.
 
-    A passing hand or a quick turn does the same for less than a second, which the motion bridges.
+    A passing hand or a quick turn does the same for less than a second, which the motion bridges. A few
+    frames at the end of a map, before the camera was lost, are stated and no doubt.
     """
     share = numbers.weak_share or 0.0
     if not share:
         return None
     where = _where(spans, SpanKind.WEAK)
+    level = Verdict.NOT_TRUSTWORTHY if share > _MOSTLY else Verdict.DOUBTFUL
     return Finding(
-        Verdict.NOT_TRUSTWORTHY if share > _MOSTLY else Verdict.DOUBTFUL,
+        level if _is_long(spans, SpanKind.WEAK, share) else Verdict.GOOD,
         f"weak tracking ({where})",
-        f"Fewer than {WEAK * facts.least_inliers} map points agreed with each pose for a second or more: "
-        f"{where}.",
+        f"Fewer than {WEAK * facts.least_inliers} map points agreed with each pose, for a second or more or "
+        f"next to a loss: {where}.",
     )
 
 
@@ -172,12 +174,29 @@ def _registration(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Healt
         return None
     share = numbers.registered_share or 0.0
     where = _where(spans, SpanKind.REGISTERED)
-    is_much = not facts.depth_is_measured or share > _MUCH_REGISTERED
+    is_long = _is_long(spans, SpanKind.REGISTERED, share)
+    is_much = share > _MUCH_REGISTERED if facts.depth_is_measured else is_long
     return Finding(
         Verdict.DOUBTFUL if is_much else Verdict.GOOD,
         f"{percent(share)} placed by depth alone ({where})",
         f"The shape of the {'measured' if facts.depth_is_measured else 'predicted'} depth alone placed "
         f"{percent(share)} of the frames: {where}. Along a flat wall such poses may slide.",
+    )
+
+
+def _short_map(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """A map that was started because tracking had failed, and in which it soon failed again.
+
+    A short recording in one map is no such case.
+    """
+    times_s = facts.trajectory.timestamps_s
+    if not facts.others or len(times_s) < 2 or times_s[-1] - times_s[0] >= GOOD_SPAN_S:
+        return None
+    length_s = float(times_s[-1] - times_s[0])
+    return Finding(
+        Verdict.DOUBTFUL,
+        f"{length_s:.1f} s are too short to judge",
+        f"The camera was in this map for {length_s:.1f} s only, too short to judge it.",
     )
 
 
@@ -281,6 +300,7 @@ RULES: tuple[Rule, ...] = (
     _losses,
     _withdrawn,
     _several_maps,
+    _short_map,
     _leaps,
     _weak_tracking,
     _registration,
@@ -295,6 +315,12 @@ RULES: tuple[Rule, ...] = (
 def leaps_are_judged(numbers: HealthNumbers) -> bool:
     """Whether most steps are short enough in time to be told from a leap."""
     return numbers.judged_step_share is None or numbers.judged_step_share >= _MOSTLY
+
+
+def _is_long(spans: Sequence[HealthSpan], kind: SpanKind, share: float) -> bool:
+    """Whether one span of a kind lasts a second, or all are a share of the frames that matters."""
+    longest_s = max((span.duration_s for span in spans if span.kind is kind), default=0.0)
+    return longest_s >= LONG_S or share >= _SOME_LOST
 
 
 def _level_of(missing: float) -> Verdict:

@@ -64,20 +64,13 @@ class HealthSpan:
 def find_spans(facts: RunFacts, leaps: Ints, weak_inliers: int) -> tuple[HealthSpan, ...]:
     """All spans of a run in order of time.
 
-    Losses, withdrawn poses and other maps count however short they are, weak and registered stretches from
-    one second on.
+    Losses, withdrawn poses and other maps count however short they are. Weak and registered stretches count
+    from one second on, and shorter ones next to a loss or an end of the map, where nothing bridges them.
 
     Args:
         leaps: steps of the trajectory, see :func:`slamdepth.evaluation.leaps.find_leaps`.
         weak_inliers: fewer points that agree with a pose make it a weak one.
     """
-
-    def is_weak(step: StepResult) -> bool:
-        is_placed = step.status in _PLACED_BY_POINTS and step.timestamp_s in facts.members
-        return is_placed and step.inliers < weak_inliers
-
-    def is_registered(step: StepResult) -> bool:
-        return step.status is TrackingStatus.REGISTERED and step.timestamp_s in facts.members
 
     def is_elsewhere(step: StepResult) -> bool:
         return step.timestamp_s in facts.elsewhere
@@ -87,8 +80,7 @@ def find_spans(facts: RunFacts, leaps: Ints, weak_inliers: int) -> tuple[HealthS
         *_stretches(facts, facts.is_lost, SpanKind.LOST, _lost),
         *_stretches(facts, facts.is_withdrawn, SpanKind.WITHDRAWN, _withdrawn),
         *_stretches(facts, is_elsewhere, SpanKind.OTHER_MAP, _elsewhere),
-        *_stretches(facts, is_weak, SpanKind.WEAK, _weak, LONG_S),
-        *_stretches(facts, is_registered, SpanKind.REGISTERED, _registered, LONG_S),
+        *_badly_held(facts, weak_inliers),
         *_leap_spans(facts, leaps),
     ]
     return tuple(sorted(spans, key=lambda span: (span.from_s, span.to_s)))
@@ -120,19 +112,52 @@ def _stretches(
     belongs: Callable[[StepResult], bool],
     kind: SpanKind,
     why: Callable[[Sequence[StepResult]], str],
-    least_s: float = 0.0,
 ) -> list[HealthSpan]:
     """Spans of consecutive frames; each ends where the next frame begins."""
-    steps, start_s = facts.steps, facts.start_s
+    return [
+        HealthSpan(*_duration(facts, first, end), kind, why(facts.steps[first:end]))
+        for first, end in _runs(facts, belongs)
+    ]
+
+
+def _runs(facts: RunFacts, belongs: Callable[[StepResult], bool]) -> list[tuple[int, int]]:
+    """``(first, past the last)`` of each group of consecutive frames that belong."""
+    found, first = [], 0
+    for is_in, group in groupby(facts.steps, key=belongs):
+        end = first + len(list(group))
+        if is_in:
+            found.append((first, end))
+        first = end
+    return found
+
+
+def _duration(facts: RunFacts, first: int, end: int) -> tuple[float, float]:
+    """From and to of some frames, seconds since the first frame of the run."""
+    last = min(end, len(facts.steps) - 1)
+    from_s, to_s = (facts.steps[n].timestamp_s - facts.start_s for n in (first, last))
+    return from_s, to_s
+
+
+def _badly_held(facts: RunFacts, weak_inliers: int) -> list[HealthSpan]:
+    """Stretches of frames that few points or only the shape of their depth placed."""
+
+    def is_badly_held(step: StepResult) -> bool:
+        is_few = step.status in _PLACED_BY_POINTS and step.inliers < weak_inliers
+        return step.timestamp_s in facts.members and (is_few or step.status is TrackingStatus.REGISTERED)
+
     found = []
-    for is_in, group in groupby(range(len(steps)), key=lambda n: belongs(steps[n])):
-        at = list(group)
-        if not is_in:
+    for first, end in _runs(facts, is_badly_held):
+        around = [facts.steps[n] for n in (first - 1, end) if 0 <= n < len(facts.steps)]
+        is_bridged = len(around) == 2 and all(step.timestamp_s in facts.members for step in around)
+        from_s, to_s = _duration(facts, first, end)
+        if is_bridged and to_s - from_s < LONG_S:
             continue
-        from_s = steps[at[0]].timestamp_s - start_s
-        to_s = steps[min(at[-1] + 1, len(steps) - 1)].timestamp_s - start_s
-        if to_s - from_s >= least_s:
-            found.append(HealthSpan(from_s, to_s, kind, why([steps[n] for n in at])))
+        steps = facts.steps[first:end]
+        registered = sum(step.status is TrackingStatus.REGISTERED for step in steps)
+        kind, why = (
+            (SpanKind.REGISTERED, _registered) if 2 * registered > len(steps) else (SpanKind.WEAK, _weak)
+        )
+        found.append(HealthSpan(from_s, to_s, kind, why(steps)))
     return found
 
 
@@ -158,7 +183,7 @@ def _weak(steps: Sequence[StepResult]) -> str:
 
 
 def _registered(steps: Sequence[StepResult]) -> str:
-    return f"{len(steps)} frames were placed by the shape of their depth, without map points"
+    return f"{len(steps)} frames were placed by the shape of their depth, with hardly a map point"
 
 
 def _leap_spans(facts: RunFacts, leaps: Ints) -> list[HealthSpan]:
