@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from slamdepth.frontend.pose import (
     PoseEstimate,
     pixel_covariance,
+    pose_covariance,
     pose_from_scratch,
     refine_pose,
 )
@@ -94,6 +95,93 @@ def test_information_predicts_the_scatter() -> None:
     whitened = np.linalg.inv(np.linalg.cholesky(predicted)) @ np.cov(np.array(scatter).T)
     whitened = whitened @ np.linalg.inv(np.linalg.cholesky(predicted)).T
     np.testing.assert_allclose(np.linalg.eigvalsh(whitened), 1.0, atol=0.45)
+
+
+def scatter_over_prediction(noise: Any, runs: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    """Monte Carlo with errors ``noise(px, rng) (n, 2)``: eigenvalues of the scatter of poses over the
+    prediction of :func:`pose_covariance`, and over the inverse of the information."""
+    X, T = scene(400)
+    px, _ = project(CAMERA, transform(T, X))
+    rng = np.random.default_rng(0)
+    none, one = np.zeros((len(X), 3, 3)), np.ones(len(X))
+    scatter, predicted, information = [], np.zeros((6, 6)), np.zeros((6, 6))
+    for _ in range(runs):
+        noisy = px + noise(px, rng)
+        estimate = refine(T, X, noisy, gate=np.inf, rounds=2)
+        D = invert(estimate.T_camera_world), invert(T)
+        moved = D[0][:3, 3] - D[1][:3, 3]
+        scatter.append(np.concatenate([moved, so3_log(D[0][:3, :3] @ D[1][:3, :3].T)]))
+        covariance = pose_covariance(CAMERA, estimate.T_camera_world, X, none, noisy, one)
+        assert covariance is not None
+        predicted += covariance / runs
+        information += estimate.information / runs
+    empirical = np.cov(np.array(scatter).T)
+    axes = np.zeros((6, 6))
+    axes[:3, :3] = axes[3:, 3:] = T[:3, :3].T
+    naive = axes @ np.linalg.inv(information) @ axes.T
+    whitened = [np.linalg.solve(covariance, empirical) for covariance in (predicted, naive)]
+    return np.linalg.eigvals(whitened[0]).real, np.linalg.eigvals(whitened[1]).real
+
+
+def test_independent_errors_scatter_by_a_known_part_of_the_covariance() -> None:
+    """Hessian and scatter of the cells agree, so that the sum is twice the truth, and inflated by three."""
+    ratio, naive = scatter_over_prediction(lambda px, rng: rng.normal(size=px.shape))
+    np.testing.assert_allclose(6.0 * ratio, 1.0, atol=0.45)
+    np.testing.assert_allclose(naive, 1.0, atol=0.45)
+
+
+def test_errors_that_neighbours_share_make_the_covariance_grow() -> None:
+    """Each cell of the image is off as a whole, by half a pixel: the Hessian sees a fifth of it."""
+
+    def by_cell(px: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        cell = np.floor(px / [80.0, 60.0]).astype(int)
+        shared = rng.normal(size=(16, 16, 2))
+        return np.asarray(shared[cell[:, 0] + 4, cell[:, 1] + 4] + 0.3 * rng.normal(size=px.shape))
+
+    ratio, naive = scatter_over_prediction(by_cell)
+    assert naive.mean() > 4.0
+    assert (ratio < 1.0).all()
+    assert ratio.mean() > 0.15
+
+
+def test_the_covariance_is_of_the_camera_in_the_world() -> None:
+    """Matches of points ahead: the sideways position and the turn about the vertical go together, and the
+    axes are those of the world however the world is turned."""
+    X, T = scene(200)
+    px, _ = project(CAMERA, transform(T, X))
+    px += np.random.default_rng(3).normal(size=px.shape)
+    none, one = np.zeros((len(X), 3, 3)), np.ones(len(X))
+    covariance = pose_covariance(CAMERA, T, X, none, px, one)
+    turned = se3_exp(np.array([5.0, -3.0, 2.0, 0.4, 1.1, -0.7]))
+    again = pose_covariance(CAMERA, T @ invert(turned), transform(turned, X), none, px, one)
+    assert covariance is not None
+    assert again is not None
+    axes = np.kron(np.eye(2), turned[:3, :3])
+    np.testing.assert_allclose(again, axes @ covariance @ axes.T, rtol=1e-6, atol=1e-12)
+    assert np.linalg.eigvalsh(covariance)[0] > 0
+
+
+def test_matches_that_do_not_determine_a_pose_have_no_covariance() -> None:
+    X, T = scene(60)
+    px, _ = project(CAMERA, transform(T, X))
+    none, one = np.zeros((60, 3, 3)), np.ones(60)
+    assert pose_covariance(CAMERA, T, X[:5], none[:5], px[:5], one[:5]) is None
+    same = np.repeat(X[:1], 60, axis=0)
+    assert pose_covariance(CAMERA, T, same, none, np.repeat(px[:1], 60, axis=0), one) is None
+
+
+def test_matches_in_one_corner_leave_a_larger_covariance() -> None:
+    X, T = scene(400)
+    px, _ = project(CAMERA, transform(T, X))
+    rng = np.random.default_rng(0)
+    px += 0.5 * rng.normal(size=px.shape)
+    corner = np.flatnonzero((px < [200, 160]).all(axis=1))
+    spread = rng.permutation(400)[: len(corner)]
+    none, one = np.zeros((400, 3, 3)), np.ones(400)
+    of = [pose_covariance(CAMERA, T, X[at], none[at], px[at], one[at]) for at in (corner, spread)]
+    assert of[0] is not None
+    assert of[1] is not None
+    assert np.trace(of[0]) > 3.0 * np.trace(of[1])
 
 
 def along_ray(X: np.ndarray, sigma_log: float, across_m: float = 1e-3) -> np.ndarray:

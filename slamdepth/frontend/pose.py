@@ -26,6 +26,10 @@ HUBER = 1.345
 _NEAREST_M = 0.02
 _CONVERGED = 1e-5  # metres and radians: a hundredth of a pixel
 _ROUGHLY_CONVERGED = 2e-4  # enough to classify outliers
+_FEWEST_MATCHES = 6  # for a covariance; three determine a pose and leave no residual
+_SINGULAR = 1e-9  # least eigenvalue of the Hessian scaled to a unit diagonal
+_CELLS = 8  # along each side of the image, whose matches share their errors
+_INFLATION = 3.0
 _REWHITEN = 0.01  # metres and radians of motion that leave a point's covariance in the image alike
 
 
@@ -140,6 +144,66 @@ def _newton_step(H: Floats, g: Floats) -> Floats:
     return np.asarray(-step, dtype=np.float64)
 
 
+def pose_covariance(
+    camera: Camera,
+    T_camera_world: Floats,
+    points_w: Floats,
+    covariance_w: Floats,
+    px: Floats,
+    sigma_px: Floats,
+) -> Floats | None:
+    """Covariance of an optimised pose, from matches whose errors are alike within a part of the image.
+
+    The inverse of the Gauss-Newton Hessian takes all errors for independent. Neighbours in the image share
+    theirs: of the map, of the lens, of the shutter. So the residuals are summed within the cells of a grid,
+    and the scatter of these sums is added (the cluster-robust "sandwich" estimator, Liang and Zeger 1986).
+    Both see only what is not common to all matches, so the sum is inflated by a constant, measured over the
+    motion of a second against true poses.
+
+    Args:
+        T_camera_world: ``(4, 4)``, optimised over these matches.
+        points_w: ``(N, 3)`` m; covariance_w: ``(N, 3, 3)`` m^2.
+        px: ``(N, 2)`` undistorted pixels; sigma_px: ``(N,)``.
+
+    Returns:
+        ``(6, 6)`` of ``(translation, rotation)`` in metres and radians, both along the axes of the world:
+        the true camera centre is ``center_w + translation`` and the true ``R_world_camera`` is
+        ``so3_exp(rotation) @ R_world_camera``. None where the matches do not determine the pose.
+    """
+    if len(points_w) < _FEWEST_MATCHES:
+        return None
+    match = _Matches(camera, points_w.T.copy(), covariance_w, px.T.copy(), sigma_px)
+    points_c = match.seen_from(T_camera_world)
+    whitening = match.whitening(T_camera_world, points_c)
+    J = match.derivatives(points_c, whitening)
+    r = np.stack(match.residual(points_c, whitening))
+    H = J.reshape(6, -1) @ J.reshape(6, -1).T
+    # translation and rotation differ by orders of magnitude: the condition of the scaled matrix counts
+    unit = 1.0 / np.sqrt(np.maximum(H.diagonal(), 1e-300))
+    values, vectors = np.linalg.eigh(H * unit[:, None] * unit)
+    if not values[0] > _SINGULAR:
+        return None
+    inverse = (vectors / values) @ vectors.T * unit[:, None] * unit
+    sums = _sums_by_cell(camera, match.px, J[:, 0] * r[0] + J[:, 1] * r[1])
+    cells = len(sums)
+    scatter = sums.T @ sums * (cells / max(cells - 1.0, 1.0))
+    covariance = _INFLATION * (inverse + inverse @ scatter @ inverse)
+    # the left perturbation of T_camera_world moves the camera by -R_world_camera, see se3_exp
+    R = np.zeros((6, 6))
+    R[:3, :3] = R[3:, 3:] = T_camera_world[:3, :3].T
+    return np.asarray(R @ covariance @ R.T)
+
+
+def _sums_by_cell(camera: Camera, px: Floats, values: Floats) -> Floats:
+    """Sums of ``values (6, N)`` over the cells of a grid that hold any of ``px (2, N)``, ``(cells, 6)``."""
+    column = np.clip(px[0] * (_CELLS / camera.width), 0, _CELLS - 1).astype(np.int64)
+    row = np.clip(px[1] * (_CELLS / camera.height), 0, _CELLS - 1).astype(np.int64)
+    cell = _CELLS * row + column
+    count = _CELLS * _CELLS
+    sums = np.stack([np.bincount(cell, of_one, count) for of_one in values], axis=1)
+    return np.asarray(sums[np.bincount(cell, minlength=count) > 0])
+
+
 class _Matches:
     """Points and their measurements, one row per coordinate."""
 
@@ -190,11 +254,18 @@ class _Matches:
 
     def normal_equations(self, points_c: Floats, whitening: Floats, *, robust: bool) -> tuple[Floats, Floats]:
         """``(6, 6)`` and ``(6,)`` for the left perturbation (translation, rotation)."""
+        r = np.stack(self.residual(points_c, whitening))
+        J = self.derivatives(points_c, whitening)
+        Jw = J
+        if robust:
+            Jw = J * (HUBER / np.maximum(np.sqrt((r * r).sum(axis=0)), HUBER))
+        return Jw.reshape(6, -1) @ J.reshape(6, -1).T, Jw.reshape(6, -1) @ r.ravel()
+
+    def derivatives(self, points_c: Floats, whitening: Floats) -> Floats:
+        """``(6, 2, N)`` of the whitened residuals by the left perturbation (translation, rotation)."""
         camera = self.camera
         x, y = points_c[:2]
         z = np.maximum(points_c[2], _NEAREST_M)
-        r = np.stack(self.residual(points_c, whitening))
-        # the two whitened rows of the derivative by the point
         J = np.empty((6, 2, len(z)))
         J[0] = whitening[:2] * (camera.fx / z)
         J[1, 0], J[1, 1] = 0.0, whitening[2] * (camera.fy / z)
@@ -203,10 +274,7 @@ class _Matches:
         J[3] = J[2] * y - J[1] * z
         J[4] = J[0] * z - J[2] * x
         J[5] = J[1] * x - J[0] * y
-        Jw = J
-        if robust:
-            Jw = J * (HUBER / np.maximum(np.sqrt((r * r).sum(axis=0)), HUBER))
-        return Jw.reshape(6, -1) @ J.reshape(6, -1).T, Jw.reshape(6, -1) @ r.ravel()
+        return J
 
 
 def pose_from_scratch(
