@@ -244,6 +244,14 @@ class StepResult:
         timings_ms: wall time of each stage in milliseconds.
         map_id: the map whose world frame the pose is in, numbered from 0 as maps are started. Where maps
             have been joined, that of the one that went on.
+        covariance: ``(6, 6)`` of the pose, in the map's metres and radians, ``(translation, rotation)`` as in
+            :func:`slamdepth.geometry.se3_exp`, both along the axes of the world: the true camera centre is
+            the pose's plus ``translation``, the true rotation ``so3_exp(rotation) @ R_world_camera``. It is
+            of the pose relative to the map around it, which covers the motion of about a second: the drift
+            of the map and its scale are not in it. None where the frame has no pose, or where too few
+            landmarks determine it (registration of depth).
+        quality: probability by ``covariance`` that the pose is within 2 % of the scene's distance and within
+            2 degrees, 0 to 1; 0 where there is no covariance.
     """
 
     index: int
@@ -256,6 +264,8 @@ class StepResult:
     loop_closures: int = 0
     timings_ms: dict[str, float] = field(default_factory=dict)
     map_id: int = 0
+    covariance: NDArray[np.float64] | None = None
+    quality: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a placed frame's pose can be believed, and how accurate it is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from slamdepth.frontend.features import Features
+from slamdepth.frontend.pose import pose_covariance
+from slamdepth.mapping.map_view import NEAREST_M, MapView
+from slamdepth.mapping.placement import Placement
+from slamdepth.types import Camera
+from slamdepth.typing import Floats
+
+GOOD_SHARE = 0.02
+"""A good pose is off by less than this share of the scene's distance,"""
+GOOD_RAD = math.radians(2.0)
+"""and by less than this angle."""
+
+
+_CAMERA_SHARE = 0.0075
+_MOTION_S = 1.0
+_MAX_GAP_S = 1.0  # a step over a longer time says nothing of the motion now
+
+
+class PoseUncertainty:
+    """The covariance and the quality of each pose, see :class:`slamdepth.types.StepResult`.
+
+    To the covariance by the matches comes what all matches of a camera share: errors of its intrinsics, lens,
+    shutter and clock. They grow with the motion, so 0.75 % of the image motion of a second is added, an angle
+    plus a length over the distance of the scene.
+
+    Args:
+        camera: that took the frames.
+    """
+
+    def __init__(self, camera: Camera, map_: MapView) -> None:
+        self._camera = camera.without_distortion()
+        self._map = map_
+        self._last: tuple[float, Floats] | None = None  # time and T_camera_world
+
+    def __call__(
+        self, timestamp_s: float, features: Features, placement: Placement
+    ) -> tuple[Floats | None, float]:
+        """Covariance and quality of the next placed frame.
+
+        Args:
+            features: of the frame; ``placement`` says which landmark each sees.
+
+        Returns:
+            ``(None, 0.0)`` where too few landmarks determine the pose.
+        """
+        at = np.flatnonzero(placement.landmark_ids >= 0)
+        ids = placement.landmark_ids[at]
+        T, landmarks = placement.T_camera_world, self._map.landmarks
+        points_w = landmarks.position_w[ids]
+        before, self._last = self._last, (timestamp_s, T)
+        covariance = pose_covariance(
+            self._camera, T, points_w, landmarks.covariance_w[ids], features.px[at], features.sigma_px[at]
+        )
+        if covariance is None:
+            return None, 0.0
+        distance = max(float(np.median(points_w @ T[2, :3] + T[2, 3])), NEAREST_M)
+        if before is not None and timestamp_s - before[0] <= _MAX_GAP_S:
+            turn, length = _motion_between(before[1], T)
+            common = _CAMERA_SHARE * (turn + length / distance) * _MOTION_S / (timestamp_s - before[0])
+            covariance.flat[::7] += np.repeat([(common * distance) ** 2, common**2], 3)
+        return covariance, pose_quality(covariance, distance)
+
+
+def _motion_between(T_a: Floats, T_b: Floats) -> tuple[float, float]:
+    """Angle in radians and length in metres of the motion between two ``T_camera_world (4, 4)``."""
+    cosine = 0.5 * (float(np.sum(T_a[:3, :3] * T_b[:3, :3])) - 1.0)
+    center_a, center_b = T_a[:3, :3].T @ T_a[:3, 3], T_b[:3, :3].T @ T_b[:3, 3]
+    return math.acos(min(max(cosine, -1.0), 1.0)), float(np.linalg.norm(center_b - center_a))
+
+
+def pose_quality(covariance: Floats, distance: float) -> float:
+    """Probability that a pose is within 2 % of the scene's distance and within 2 degrees.
+
+    Args:
+        covariance: ``(6, 6)`` of ``(translation, rotation)``, metres and radians.
+        distance: of the scene, metres.
+    """
+    position = _probability_within(covariance[:3, :3], GOOD_SHARE * max(distance, 0.0))
+    return position * _probability_within(covariance[3:, 3:], GOOD_RAD)
+
+
+def _probability_within(covariance: Floats, radius: float) -> float:
+    """Probability that a normal vector with ``covariance (3, 3)`` is shorter than ``radius``.
+
+    Its squared length is taken for a scaled chi-square of the same mean and variance (Satterthwaite 1946),
+    whose cube root is nearly normal (Wilson and Hilferty 1931).
+    """
+    mean, squares = float(np.trace(covariance)), float(np.sum(covariance * covariance))
+    if not mean > 0.0:
+        return 1.0
+    spread = 2.0 / 9.0 * squares / (mean * mean)
+    z = ((radius * radius / mean) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread)
+    return 0.5 * math.erfc(-z / math.sqrt(2.0))
