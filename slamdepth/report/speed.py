@@ -13,6 +13,7 @@ _NAMES = {
     "decode": "reading images",
     "features": "extracting features",
     "tracking": "tracking frames",
+    "uncertainty": "covariance of poses",
     "depth": "depth of keyframes",
     "mapping": "creating landmarks",
     "bundle": "local bundle adjustment",

@@ -22,10 +22,12 @@ from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.integration import KeyframeIntegration
 from slamdepth.tracking.localiser import Localiser
 from slamdepth.tracking.motion import MotionModel
+from slamdepth.tracking.pose_check import PoseUncertainty
 from slamdepth.tracking.relocaliser import Relocaliser
 from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.tracking.workers import Workers
 from slamdepth.types import Camera, Frame
+from slamdepth.typing import Floats
 
 _SAME_MOTION = 0.8  # of a frame's landmarks agree still; of consecutive frames 0.92 and more
 
@@ -38,11 +40,14 @@ class Placed:
         placement: its pose in the map as it is now.
         placed_by: how it was found.
         is_keyframe: True where it became a keyframe.
+        covariance, quality: of the pose, see :class:`StepResult`.
     """
 
     placement: Placement
     placed_by: PlacedBy
     is_keyframe: bool
+    covariance: Floats | None
+    quality: float
 
 
 class MapTracker:
@@ -55,7 +60,8 @@ class MapTracker:
 
     Attributes:
         id: number of the map, from 0 in the order of their start.
-        map, frames, motion, shutter, localiser, integration, relocaliser: the parts, of this map alone.
+        map, frames, motion, shutter, localiser, uncertainty, integration, relocaliser: the parts, of this map
+            alone.
         placed_by: how many frames were placed by what.
     """
 
@@ -77,6 +83,7 @@ class MapTracker:
         self.motion = MotionModel()
         self.shutter = RollingShutter(camera, config.shutter, self.map)
         self.localiser = Localiser(camera, config, self.map, levels)
+        self.uncertainty = PoseUncertainty(camera, self.map)
         self.integration = KeyframeIntegration(
             camera,
             config,
@@ -108,7 +115,7 @@ class MapTracker:
         origin = Placement(np.eye(4), np.full(len(features), -1, dtype=np.int64))
         placement = self._add_keyframe(frame, features, origin)
         self.frames.add(frame.timestamp_s, features, placement, is_keyframe=True)
-        return Placed(placement, PlacedBy.MOTION, is_keyframe=True)
+        return self._placed(frame, features, placement, PlacedBy.MOTION, is_keyframe=True)
 
     def track(self, frame: Frame, raw: Features) -> Placed | None:
         """Place a frame in the map, and make it a keyframe where the view has moved on.
@@ -156,6 +163,7 @@ class MapTracker:
         """Express everything in another world frame, and in its metres; no keyframe waits."""
         self.map.move(similarity)
         self.motion.rescale(similarity.scale)
+        self.uncertainty.forget_motion()
         self.integration.gravity.turn(similarity.T_a_b[:3, :3])
 
     def absorb(self, other: MapTracker, meetings: Sequence[Meeting]) -> None:
@@ -167,6 +175,7 @@ class MapTracker:
         first_keyframe, first_landmark = self.map.absorb(other.map)
         self.frames.absorb(other.frames, first_landmark)
         self.motion = other.motion
+        self.uncertainty.forget_motion()
         ids = self.motion.landmark_ids
         self.motion.landmark_ids = np.where(ids >= 0, ids + first_landmark, -1)
         self.placed_by += other.placed_by
@@ -189,7 +198,20 @@ class MapTracker:
             self.motion.advance(frame.timestamp_s, placement.T_camera_world)
             self.motion.anchor(placement, self.map.keyframes[-1])
         self.frames.add(frame.timestamp_s, raw, placement, is_keyframe, follows_motion=follows_motion)
-        return Placed(placement, placed_by, is_keyframe)
+        return self._placed(frame, features, placement, placed_by, is_keyframe=is_keyframe)
+
+    def _placed(
+        self,
+        frame: Frame,
+        features: Features,
+        placement: Placement,
+        placed_by: PlacedBy,
+        *,
+        is_keyframe: bool,
+    ) -> Placed:
+        with self._watch.timed("uncertainty"):
+            covariance, quality = self.uncertainty(frame.timestamp_s, features, placement)
+        return Placed(placement, placed_by, is_keyframe, covariance, quality)
 
     def run_stage(self) -> None:
         """Go on with the integration of keyframes before the next frame."""

@@ -41,6 +41,10 @@ class PoseUncertainty:
         self._map = map_
         self._last: tuple[float, Floats] | None = None  # time and T_camera_world
 
+    def forget_motion(self) -> None:
+        """The last pose is in another world frame now."""
+        self._last = None
+
     def __call__(
         self, timestamp_s: float, features: Features, placement: Placement
     ) -> tuple[Floats | None, float]:

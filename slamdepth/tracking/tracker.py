@@ -130,6 +130,8 @@ class Tracker:
             loop_closures=sum(map_.integration.loops.count for map_ in maps),
             timings_ms=self._watch.frame_ms,
             map_id=self._active.id,
+            covariance=None if placed is None else placed.covariance,
+            quality=0.0 if placed is None else placed.quality,
         )
 
     def finish(self) -> Reconstruction:
