@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from slamdepth.geometry import invert, so3_log, transform
@@ -17,6 +19,7 @@ _LEAST_STEP_RAD = 0.05  # about 3 degrees of image motion: less is jitter, howev
 _CONFIRMED = 0.25  # of a step's velocity, found again in the step before or after
 _SAMPLES = 50  # cameras that the scene's distance is measured from
 _FEWEST_POINTS = 10
+_CONFIRM_S = 1.0  # a hand that is pushed keeps on for less
 _POINTS = 5000  # of the map, evenly chosen: the map of --odometry kiss-icp is a dense cloud
 
 
@@ -75,6 +78,67 @@ def find_leaps(trajectory: Trajectory, distance: float | None) -> Ints:
     is_far = speed * duration_s > _LEAST_STEP_RAD
     candidates = np.flatnonzero(judged & is_fast & is_far)
     return candidates[[_is_contradicted(velocity, judged, int(n)) for n in candidates]]
+
+
+def unconfirmed_poses(trajectory: Trajectory, distance: float | None) -> Bools:
+    """Poses of short pieces that only leaps join to the rest: no motion confirms them.
+
+    Leaps (:func:`find_leaps`) and gaps of over 0.25 s cut a trajectory into pieces. A piece of less than a
+    second that begins or ends with a leap is unconfirmed: a single pose that leaps there and back, or the
+    first poses of a map before it found itself. The search is repeated without them, as they hid what the
+    motion around them is. The longest piece is always kept, and so is everything of a trajectory without
+    leaps.
+
+    Args:
+        distance: of the scene, see :func:`scene_distance`; None compares rotations only.
+
+    Returns:
+        ``(N,)``, True where a pose is unconfirmed.
+    """
+    kept = np.arange(len(trajectory))
+    while len(kept) > 1:
+        rest = Trajectory(trajectory.timestamps_s[kept], trajectory.T_world_camera[kept])
+        short = _short_pieces(rest, find_leaps(rest, distance))
+        if not short.any():
+            break
+        kept = kept[~short]
+    unconfirmed = np.ones(len(trajectory), dtype=bool)
+    unconfirmed[kept] = False
+    return unconfirmed
+
+
+def confirmed(trajectory: Trajectory, points_w: Floats) -> Trajectory:
+    """The trajectory without its :func:`unconfirmed_poses`; itself where there are none.
+
+    Args:
+        points_w: ``(P, 3)`` map points, world frame.
+    """
+    drop = unconfirmed_poses(trajectory, scene_distance(trajectory, points_w))
+    if not drop.any():
+        return trajectory
+    return replace(
+        trajectory,
+        timestamps_s=trajectory.timestamps_s[~drop],
+        T_world_camera=trajectory.T_world_camera[~drop],
+    )
+
+
+def _short_pieces(trajectory: Trajectory, leaps: Ints) -> Bools:
+    """``(N,)`` whether a pose is in a piece of less than a second with a leap at an end.
+
+    The longest piece is in none.
+    """
+    is_leap = np.zeros(len(trajectory) + 1, dtype=bool)  # at n: between poses n - 1 and n
+    is_leap[leaps + 1] = True
+    is_cut = is_leap.copy()
+    is_cut[1:-1] |= ~judged_steps(trajectory)
+    is_cut[[0, -1]] = True
+    ends = np.flatnonzero(is_cut)
+    first, end = ends[:-1], ends[1:]
+    lasts_s = trajectory.timestamps_s[end - 1] - trajectory.timestamps_s[first]
+    is_short = (lasts_s < _CONFIRM_S) & (is_leap[first] | is_leap[end])
+    is_short[np.argmax(lasts_s)] = False
+    return np.repeat(is_short, end - first)
 
 
 def _image_velocity(trajectory: Trajectory, distance: float | None) -> Floats:
