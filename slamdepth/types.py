@@ -312,6 +312,7 @@ class RunStatistics:
         scale_votes: log ratio of the map's depth to the predicted depth, one per keyframe with enough
             points; their robust centre is 0 at the map's own scale. Empty with a sensor.
         maps_joined: how often two maps of the run became one.
+        withdrawn: frames that lost their pose at the end, since only leaps joined it to the others.
     """
 
     frames: int = 0
@@ -326,3 +327,4 @@ class RunStatistics:
     scale_votes: tuple[float, ...] = ()
     loops_refused: int = 0
     maps_joined: int = 0
+    withdrawn: int = 0

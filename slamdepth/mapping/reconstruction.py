@@ -22,8 +22,8 @@ class Reconstruction:
     """The optimised result of a run, as ``Tracker.finish`` returns it.
 
     Attributes:
-        trajectory: every placed frame.
-        keyframes: in order of time.
+        trajectory: every placed frame, but for those that were withdrawn, see :class:`RunStatistics`.
+        keyframes: those of the trajectory, in order of time; their ids may have gaps.
         points_m: ``(P, 3)`` float64 map points in the world frame, metres of the map.
         gravity_w: ``(3,)`` unit direction of gravity in the world frame, as most keyframes estimate it;
             None where they do not, or disagree.

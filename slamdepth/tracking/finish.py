@@ -11,6 +11,7 @@ import numpy as np
 from slamdepth.config import Config
 from slamdepth.depth.alignment import as_given, coarse_correction, corrected_depth
 from slamdepth.depth.robust_centre import robust_centre
+from slamdepth.evaluation.leaps import confirmed
 from slamdepth.geometry import invert
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.map import Map, MapKeyframe
@@ -99,10 +100,15 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
         if config.bundle.final:
             frames.refine(shutter.readout_s)
         keyframes = tuple(replace(made.result(), id=n) for n, made in enumerate(making))
+    points_m = map_.landmarks.position_w[map_.seen_by(2)]
+    found = frames.trajectory()
+    trajectory = confirmed(found, points_m)
+    kept_s = set(trajectory.timestamps_s.tolist())
+    statistics = replace(statistics, tracked=len(trajectory), withdrawn=len(found) - len(trajectory))
     return Reconstruction(
-        trajectory=frames.trajectory(),
-        keyframes=keyframes,
-        points_m=map_.landmarks.position_w[map_.seen_by(2)],
+        trajectory=trajectory,
+        keyframes=tuple(one for one in keyframes if one.frame.timestamp_s in kept_s),
+        points_m=points_m,
         gravity_w=integration.gravity.in_world(),
         notes=final.notes,
         statistics=statistics,
