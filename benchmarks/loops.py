@@ -96,7 +96,9 @@ def run(recording: Recording, depth: str, start: int, *, with_loops: bool) -> di
         is_metric=recording.is_metric,
         depth_is_true=dataset.has_depth,
     )
-    judged = judge_loops(closed_loops(tracker), truth, covisibility(tracker), config.loops.min_gap)
+    ids = [keyframe.id for keyframe in found.keyframes]
+    closed, shared = closed_loops(tracker, ids), covisibility(tracker, ids)
+    judged = judge_loops(closed, truth, shared, config.loops.min_gap)
     return {
         "frames": len(frames),
         "tracked": len(found.trajectory) / len(frames),

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from slamdepth.tracking import Tracker
 from slamdepth.typing import Floats, Ints
@@ -14,7 +17,7 @@ class ClosedLoop:
     """A loop in the pose graph.
 
     Attributes:
-        earlier, later: ids of its keyframes.
+        earlier, later: its keyframes.
         T_earlier_later: ``(4, 4)`` what the loop measured, in metres of the finished map.
     """
 
@@ -23,13 +26,16 @@ class ClosedLoop:
     T_earlier_later: Floats
 
 
-def closed_loops(tracker: Tracker) -> list[ClosedLoop]:
-    """The loops that ``tracker``, which has finished, accepted and did not take back."""
-    units = tracker._active.map.units
+def closed_loops(tracker: Tracker, keyframe_ids: Sequence[int]) -> list[ClosedLoop]:
+    """The loops between ``keyframe_ids`` that ``tracker``, which has finished, did not take back.
+
+    Keyframes are named by their position in ``keyframe_ids``.
+    """
+    units, at = tracker._active.map.units, {k: n for n, k in enumerate(keyframe_ids)}
     edges = [loop.in_units(units) for loop in tracker._active.integration.loops._loops]
-    return [ClosedLoop(edge.i, edge.j, edge.T_i_j) for edge in edges]
+    return [ClosedLoop(at[edge.i], at[edge.j], edge.T_i_j) for edge in edges if {edge.i, edge.j} <= at.keys()]
 
 
-def covisibility(tracker: Tracker) -> Ints:
-    """How many landmarks each two keyframes share, ``(K, K)``."""
-    return tracker._active.map.covisibility()
+def covisibility(tracker: Tracker, keyframe_ids: Sequence[int]) -> Ints:
+    """How many landmarks each two of ``K`` keyframes share, ``(K, K)``."""
+    return tracker._active.map.covisibility()[np.ix_(keyframe_ids, keyframe_ids)]
