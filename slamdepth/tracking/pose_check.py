@@ -21,6 +21,8 @@ GOOD_RAD = math.radians(2.0)
 
 
 _CAMERA_SHARE = 0.0075
+_DEPTH_SHARE = 0.5
+_RAYS = 100  # landmarks whose deviation along the ray is looked at
 _MOTION_S = 1.0
 _MAX_GAP_S = 1.0  # a step over a longer time says nothing of the motion now
 
@@ -28,9 +30,12 @@ _MAX_GAP_S = 1.0  # a step over a longer time says nothing of the motion now
 class PoseUncertainty:
     """The covariance and the quality of each pose, see :class:`slamdepth.types.StepResult`.
 
-    To the covariance by the matches comes what all matches of a camera share: errors of its intrinsics, lens,
-    shutter and clock. They grow with the motion, so 0.75 % of the image motion of a second is added, an angle
-    plus a length over the distance of the scene.
+    To the covariance by the matches comes what all matches of a frame share, for the motion of a second:
+
+    * errors of intrinsics, lens, shutter and clock: 0.75 % of the image motion, an angle plus a length over
+      the distance of the scene;
+    * the common error of the depths that landmarks were created from: half of their relative deviation along
+      the ray, times the length. It vanishes as landmarks are triangulated.
 
     Args:
         camera: that took the frames.
@@ -68,9 +73,12 @@ class PoseUncertainty:
             return None, 0.0
         distance = max(float(np.median(points_w @ T[2, :3] + T[2, 3])), NEAREST_M)
         if before is not None and timestamp_s - before[0] <= _MAX_GAP_S:
-            turn, length = _motion_between(before[1], T)
-            common = _CAMERA_SHARE * (turn + length / distance) * _MOTION_S / (timestamp_s - before[0])
-            covariance.flat[::7] += np.repeat([(common * distance) ** 2, common**2], 3)
+            turn, length = np.array(_motion_between(before[1], T)) * (_MOTION_S / (timestamp_s - before[0]))
+            camera_rad = _CAMERA_SHARE * (turn + length / distance)
+            sigma = self._map.sigma_along_ray(ids[:: 1 + len(ids) // _RAYS], -T[:3, :3].T @ T[:3, 3])
+            depth_m = _DEPTH_SHARE * float(np.median(sigma)) * length
+            position_m2 = (camera_rad * distance) ** 2 + depth_m**2
+            covariance.flat[::7] += np.repeat([position_m2, camera_rad**2], 3)
         return covariance, pose_quality(covariance, distance)
 
 
