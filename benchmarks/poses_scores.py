@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from slamdepth.geometry import invert, skew, so3_exp, so3_log
-from slamdepth.tracking.pose_check import GOOD_RAD, GOOD_SHARE
+from slamdepth.tracking.pose_uncertainty import GOOD_RAD, GOOD_SHARE
 from slamdepth.types import StepResult, Trajectory
 from slamdepth.typing import Bools, Floats, Ints
 

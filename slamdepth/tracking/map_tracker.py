@@ -22,7 +22,7 @@ from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.integration import KeyframeIntegration
 from slamdepth.tracking.localiser import Localiser
 from slamdepth.tracking.motion import MotionModel
-from slamdepth.tracking.pose_check import PoseUncertainty
+from slamdepth.tracking.pose_uncertainty import PoseUncertainty
 from slamdepth.tracking.relocaliser import Relocaliser
 from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.tracking.workers import Workers

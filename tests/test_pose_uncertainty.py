@@ -8,7 +8,7 @@ import pytest
 from tracking_scene import ConstantDepth, Run, colour_only, frames, grey, walk
 
 from slamdepth.geometry import invert
-from slamdepth.tracking.pose_check import GOOD_RAD, pose_quality
+from slamdepth.tracking.pose_uncertainty import GOOD_RAD, pose_quality
 
 
 @pytest.mark.parametrize("deviations", [(1, 1, 1), (3, 1, 0.2), (1, 0.3, 0.3)])

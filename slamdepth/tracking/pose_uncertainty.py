@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a placed frame's pose can be believed, and how accurate it is."""
+"""How accurate a placed frame's pose is."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ GOOD_SHARE = 0.02
 """A good pose is off by less than this share of the scene's distance,"""
 GOOD_RAD = math.radians(2.0)
 """and by less than this angle."""
-
 
 _CAMERA_SHARE = 0.0075
 _DEPTH_SHARE = 0.5
@@ -39,12 +38,16 @@ class PoseUncertainty:
 
     Args:
         camera: that took the frames.
+
+    Attributes:
+        image_sigma: deviation of the last pose as image motion, radians.
     """
 
     def __init__(self, camera: Camera, map_: MapView) -> None:
         self._camera = camera.without_distortion()
         self._map = map_
         self._last: tuple[float, Floats] | None = None  # time and T_camera_world
+        self.image_sigma = 0.0
 
     def forget_motion(self) -> None:
         """The last pose is in another world frame now."""
@@ -73,16 +76,18 @@ class PoseUncertainty:
             return None, 0.0
         distance = max(float(np.median(points_w @ T[2, :3] + T[2, 3])), NEAREST_M)
         if before is not None and timestamp_s - before[0] <= _MAX_GAP_S:
-            turn, length = np.array(_motion_between(before[1], T)) * (_MOTION_S / (timestamp_s - before[0]))
+            turn, length = np.array(motion_between(before[1], T)) * (_MOTION_S / (timestamp_s - before[0]))
             camera_rad = _CAMERA_SHARE * (turn + length / distance)
             sigma = self._map.sigma_along_ray(ids[:: 1 + len(ids) // _RAYS], -T[:3, :3].T @ T[:3, 3])
             depth_m = _DEPTH_SHARE * float(np.median(sigma)) * length
             position_m2 = (camera_rad * distance) ** 2 + depth_m**2
             covariance.flat[::7] += np.repeat([position_m2, camera_rad**2], 3)
+        variance = covariance.diagonal()
+        self.image_sigma = math.sqrt(variance[3:].sum()) + math.sqrt(variance[:3].sum()) / distance
         return covariance, pose_quality(covariance, distance)
 
 
-def _motion_between(T_a: Floats, T_b: Floats) -> tuple[float, float]:
+def motion_between(T_a: Floats, T_b: Floats) -> tuple[float, float]:
     """Angle in radians and length in metres of the motion between two ``T_camera_world (4, 4)``."""
     cosine = 0.5 * (float(np.sum(T_a[:3, :3] * T_b[:3, :3])) - 1.0)
     center_a, center_b = T_a[:3, :3].T @ T_a[:3, 3], T_b[:3, :3].T @ T_b[:3, 3]
