@@ -151,6 +151,8 @@ def pose_covariance(
     covariance_w: Floats,
     px: Floats,
     sigma_px: Floats,
+    *,
+    sampled: float = 1.0,
 ) -> Floats | None:
     """Covariance of an optimised pose, from matches whose errors are alike within a part of the image.
 
@@ -164,6 +166,7 @@ def pose_covariance(
         T_camera_world: ``(4, 4)``, optimised over these matches.
         points_w: ``(N, 3)`` m; covariance_w: ``(N, 3, 3)`` m^2.
         px: ``(N, 2)`` undistorted pixels; sigma_px: ``(N,)``.
+        sampled: share of the matches that are given, evenly chosen.
 
     Returns:
         ``(6, 6)`` of ``(translation, rotation)`` in metres and radians, both along the axes of the world:
@@ -187,7 +190,7 @@ def pose_covariance(
     sums = _sums_by_cell(camera, match.px, J[:, 0] * r[0] + J[:, 1] * r[1])
     cells = len(sums)
     scatter = sums.T @ sums * (cells / max(cells - 1.0, 1.0))
-    covariance = _INFLATION * (inverse + inverse @ scatter @ inverse)
+    covariance = _INFLATION * (sampled * inverse + inverse @ scatter @ inverse)
     # the left perturbation of T_camera_world moves the camera by -R_world_camera, see se3_exp
     R = np.zeros((6, 6))
     R[:3, :3] = R[3:, 3:] = T_camera_world[:3, :3].T

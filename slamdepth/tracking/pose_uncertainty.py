@@ -21,7 +21,7 @@ GOOD_RAD = math.radians(2.0)
 
 _CAMERA_SHARE = 0.0075
 _DEPTH_SHARE = 0.5
-_RAYS = 100  # landmarks whose deviation along the ray is looked at
+_MATCHES = 150  # that are looked at: a sample says enough, in a third of the time
 _MOTION_S = 1.0
 _MAX_GAP_S = 1.0  # a step over a longer time says nothing of the motion now
 
@@ -65,12 +65,20 @@ class PoseUncertainty:
             ``(None, 0.0)`` where too few landmarks determine the pose.
         """
         at = np.flatnonzero(placement.landmark_ids >= 0)
+        every = 1 + len(at) // _MATCHES
+        at = at[::every]
         ids = placement.landmark_ids[at]
         T, landmarks = placement.T_camera_world, self._map.landmarks
         points_w = landmarks.position_w[ids]
         before, self._last = self._last, (timestamp_s, T)
         covariance = pose_covariance(
-            self._camera, T, points_w, landmarks.covariance_w[ids], features.px[at], features.sigma_px[at]
+            self._camera,
+            T,
+            points_w,
+            landmarks.covariance_w[ids],
+            features.px[at],
+            features.sigma_px[at],
+            sampled=1.0 / every,
         )
         if covariance is None:
             return None, 0.0
@@ -78,7 +86,7 @@ class PoseUncertainty:
         if before is not None and timestamp_s - before[0] <= _MAX_GAP_S:
             turn, length = np.array(motion_between(before[1], T)) * (_MOTION_S / (timestamp_s - before[0]))
             camera_rad = _CAMERA_SHARE * (turn + length / distance)
-            sigma = self._map.sigma_along_ray(ids[:: 1 + len(ids) // _RAYS], -T[:3, :3].T @ T[:3, 3])
+            sigma = self._map.sigma_along_ray(ids, -T[:3, :3].T @ T[:3, 3])
             depth_m = _DEPTH_SHARE * float(np.median(sigma)) * length
             position_m2 = (camera_rad * distance) ** 2 + depth_m**2
             covariance.flat[::7] += np.repeat([position_m2, camera_rad**2], 3)
