@@ -312,7 +312,7 @@ class RunStatistics:
         scale_votes: log ratio of the map's depth to the predicted depth, one per keyframe with enough
             points; their robust centre is 0 at the map's own scale. Empty with a sensor.
         maps_joined: how often two maps of the run became one.
-        withdrawn: frames that lost their pose at the end, since only leaps joined it to the others.
+        withdrawn: frames whose pose was taken back, since no motion confirmed it.
     """
 
     frames: int = 0

@@ -104,7 +104,8 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
     found = frames.trajectory()
     trajectory = confirmed(found, points_m)
     kept_s = set(trajectory.timestamps_s.tolist())
-    statistics = replace(statistics, tracked=len(trajectory), withdrawn=len(found) - len(trajectory))
+    withdrawn = frames.withdrawn + len(found) - len(trajectory)
+    statistics = replace(statistics, tracked=len(trajectory), withdrawn=withdrawn)
     return Reconstruction(
         trajectory=trajectory,
         keyframes=tuple(one for one in keyframes if one.frame.timestamp_s in kept_s),

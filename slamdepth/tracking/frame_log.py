@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,6 +63,9 @@ class FrameLog:
     """Placed frames, relative to a keyframe each, with what they saw (kiss-slam's local frames).
 
     Whatever moves a keyframe moves its frames. Pixels are kept as the shutter took them.
+
+    Attributes:
+        withdrawn: number of frames that were placed and have no pose any more.
     """
 
     def __init__(self, camera: Camera, map_: Map) -> None:
@@ -69,6 +73,7 @@ class FrameLog:
         self._camera = camera.without_distortion()
         self._map = map_
         self._placed: list[_Placed] = []
+        self.withdrawn = 0
         # ids are remembered as they were then, offset by all ids that compactions have renumbered
         self._ids_now = np.zeros(0, dtype=np.int32)
         self._prune_at = _PRUNE_AT
@@ -119,6 +124,13 @@ class FrameLog:
             )
         )
 
+    def withdraw(self, times_s: Sequence[float]) -> None:
+        """Forget the poses of frames of these times; keyframes keep theirs."""
+        if times_s:
+            before = len(self._placed)
+            kept = [p for p in self._placed if p.is_keyframe or p.timestamp_s not in times_s]
+            self._placed, self.withdrawn = kept, self.withdrawn + before - len(kept)
+
     def renumber(self, ids_now: Ints) -> None:
         """Follow new landmark ids ``(size + 1,)``, see :meth:`Map.compact`."""
         self._ids_now = np.concatenate([ids_now[self._ids_now], ids_now[:-1]]).astype(np.int32)
@@ -136,6 +148,7 @@ class FrameLog:
         other._prune()
         for placed in other._placed:
             placed.landmark_ids = placed.landmark_ids + np.int32(first_landmark + len(self._ids_now))
+        self.withdrawn += other.withdrawn
         self._placed = sorted(self._placed + other._placed, key=lambda placed: placed.timestamp_s)
 
     def _prune(self) -> None:

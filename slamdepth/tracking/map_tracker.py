@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,12 +23,14 @@ from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.integration import KeyframeIntegration
 from slamdepth.tracking.localiser import Localiser
 from slamdepth.tracking.motion import MotionModel
-from slamdepth.tracking.pose_uncertainty import PoseUncertainty
+from slamdepth.tracking.pose_check import PoseCheck, Verdict
 from slamdepth.tracking.relocaliser import Relocaliser
 from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.tracking.workers import Workers
 from slamdepth.types import Camera, Frame
 from slamdepth.typing import Floats
+
+log = logging.getLogger(__name__)
 
 _SAME_MOTION = 0.8  # of a frame's landmarks agree still; of consecutive frames 0.92 and more
 
@@ -60,8 +63,7 @@ class MapTracker:
 
     Attributes:
         id: number of the map, from 0 in the order of their start.
-        map, frames, motion, shutter, localiser, uncertainty, integration, relocaliser: the parts, of this map
-            alone.
+        map, frames, motion, shutter, localiser, check, integration, relocaliser: the parts, of this map alone.
         placed_by: how many frames were placed by what.
     """
 
@@ -83,7 +85,7 @@ class MapTracker:
         self.motion = MotionModel()
         self.shutter = RollingShutter(camera, config.shutter, self.map)
         self.localiser = Localiser(camera, config, self.map, levels)
-        self.uncertainty = PoseUncertainty(camera, self.map)
+        self.check = PoseCheck(camera, self.map, self.localiser)
         self.integration = KeyframeIntegration(
             camera,
             config,
@@ -138,7 +140,7 @@ class MapTracker:
         """Place a frame by what it looks like, in a map that the camera was not in."""
         with self._watch.timed("tracking"):
             placement = self.relocaliser.by_place(raw)
-        if placement is None:
+        if placement is None or not self._is_earned(frame, raw, placement):
             return None
         self.placed_by[placement.placed_by] += 1
         self.map.count_views(placement.expected_ids, placement.found_ids)
@@ -163,7 +165,7 @@ class MapTracker:
         """Express everything in another world frame, and in its metres; no keyframe waits."""
         self.map.move(similarity)
         self.motion.rescale(similarity.scale)
-        self.uncertainty.forget_motion()
+        self.check.forget_motion()
         self.integration.gravity.turn(similarity.T_a_b[:3, :3])
 
     def absorb(self, other: MapTracker, meetings: Sequence[Meeting]) -> None:
@@ -175,7 +177,7 @@ class MapTracker:
         first_keyframe, first_landmark = self.map.absorb(other.map)
         self.frames.absorb(other.frames, first_landmark)
         self.motion = other.motion
-        self.uncertainty.forget_motion()
+        self.check.forget_motion()
         ids = self.motion.landmark_ids
         self.motion.landmark_ids = np.where(ids >= 0, ids + first_landmark, -1)
         self.placed_by += other.placed_by
@@ -189,6 +191,7 @@ class MapTracker:
         """Add a placed frame to the log, and to the map where the view has moved on."""
         follows_motion = self.motion.is_known
         is_keyframe = self.integration.wants(placement) and self._workers.depth.has_depth(frame)
+        is_keyframe &= not self.check.is_provisional
         if is_keyframe and self.integration.is_full:
             placement = self._place_in_grown_map(features, placement)
             is_keyframe = self.integration.wants(placement)
@@ -210,7 +213,7 @@ class MapTracker:
         is_keyframe: bool,
     ) -> Placed:
         with self._watch.timed("uncertainty"):
-            covariance, quality = self.uncertainty(frame.timestamp_s, features, placement)
+            covariance, quality = self.check.uncertainty(frame.timestamp_s, features, placement)
         return Placed(placement, placed_by, is_keyframe, covariance, quality)
 
     def run_stage(self) -> None:
@@ -235,12 +238,23 @@ class MapTracker:
             self.relocaliser.schedule.count_frame()
         placement = placement or self.relocaliser.by_place(features, without=newest)
         placement = placement or self.relocaliser.by_registration(frame, features, T_guess)
+        if placement is not None and not self._is_earned(frame, features, placement):
+            return None
         if placement is not None:
             self.placed_by[placement.placed_by] += 1
             self.map.count_views(placement.expected_ids, placement.found_ids)
             if placement.placed_by in (PlacedBy.LAST_KEYFRAME, PlacedBy.PLACE):
                 self.motion.forget()  # found by its view alone: the recording may have been cut
         return placement
+
+    def _is_earned(self, frame: Frame, features: Features, placement: Placement) -> bool:
+        """Judge a pose; provisional ones before it that it contradicts are withdrawn."""
+        T_guess = self.motion.predict(frame.timestamp_s) if self.motion.is_known else None
+        judgement = self.check.judge(frame.timestamp_s, features, placement, T_guess)
+        self.frames.withdraw(judgement.withdrawn_s)
+        if judgement.why:
+            log.debug("frame %d: pose is %s: %s", frame.index, judgement.verdict.value, judgement.why)
+        return judgement.verdict is not Verdict.LOST
 
     def _track_motion(self, frame: Frame, features: Features) -> Placement | None:
         recent = self.map.resolve(self.motion.landmark_ids)
@@ -249,6 +263,7 @@ class MapTracker:
 
     def _lose(self) -> None:
         """Forget the motion; where it led to last is tried again for some frames."""
+        self.frames.withdraw(self.check.lose())
         if self.motion.is_known:
             self.relocaliser.schedule.start(self.motion.T_camera_world, self.motion.step)
         self.motion.forget()

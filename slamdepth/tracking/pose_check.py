@@ -115,6 +115,11 @@ class PoseCheck:
         withdrawn, self._provisional_s = tuple(self._provisional_s), []
         return withdrawn
 
+    def forget_motion(self) -> None:
+        """The map has moved as a whole, or grown by another one: what waits counts as confirmed."""
+        self._provisional_s = []
+        self.uncertainty.forget_motion()
+
     def _suspicion(
         self, duration_s: float, features: Features, placement: Placement, T_guess: Floats | None
     ) -> str:
