@@ -63,7 +63,7 @@ class MapTracker:
 
     Attributes:
         id: number of the map, from 0 in the order of their start.
-        map, frames, motion, shutter, localiser, check, integration, relocaliser: the parts, of this map alone.
+        map, frames, motion, shutter, localiser, check, integration, relocaliser: the parts, of this map.
         placed_by: how many frames were placed by what.
     """
 
