@@ -119,11 +119,40 @@ def test_odometry_drifts_more_over_weak_steps_and_less_with_a_sensor() -> None:
     usual, weak = weakness(np.array([400, 60])), weakness(np.array([15, 3, 0]))
     np.testing.assert_allclose(usual, 1.0)
     np.testing.assert_allclose(weak, [4.0, 20.0, 20.0])
-    strong = Drift(T, np.ones(10), is_measured=False).bound(0, 10)
-    measured = Drift(T, np.ones(10), is_measured=True).bound(0, 10)
-    broken = Drift(T, np.r_[np.ones(9), 20.0], is_measured=False).bound(0, 10)
-    np.testing.assert_allclose(measured, 0.5 * np.array(strong))
+    strong = Drift(T, np.ones(10), is_measured=False).bounds(10)[0]
+    measured = Drift(T, np.ones(10), is_measured=True).bounds(10)[0]
+    broken = Drift(T, np.r_[np.ones(9), 20.0], is_measured=False).bounds(10)[0]
+    np.testing.assert_allclose(measured, 0.5 * strong)
     assert all(b > 4.0 * s for b, s in zip(broken[:2], strong[:2], strict=True))
+
+
+@pytest.mark.parametrize("is_sensor", [True, False])
+def test_a_place_is_found_where_odometry_allows_it_though_others_look_more_alike(is_sensor: bool) -> None:
+    """Identical desks fill the first ranks of a query by appearance."""
+    world = World(TURN - 1, turn_drift=0.003, is_sensor=is_sensor, alone=True)
+    query = world.closer.places.query_keyframe
+
+    def misled(keyframe_id: int, **options: Any) -> list[tuple[int, float]]:
+        return [(TURN // 2, 1.0), (TURN // 2 + 1, 1.0), *query(keyframe_id, **options)]
+
+    world.closer.places.query_keyframe = misled  # type: ignore[method-assign]
+    assert any(world.grow() is not None for _ in range(3))
+    assert all(closure.candidate not in (TURN // 2, TURN // 2 + 1) for _, closure in world.closures)
+    assert world.turn_errors_rad().max() < 0.02
+
+
+def test_candidates_by_odometry_are_near_as_far_as_it_can_have_drifted_and_look_the_same_way() -> None:
+    T = np.tile(np.eye(4), (41, 1, 1))
+    T[:, 0, 3] = 0.1 * np.r_[np.arange(20), np.arange(20, -1, -1)]  # 2 m there and back
+    T[10:12, :3, :3] = np.diag([-1.0, 1.0, -1.0])  # about-face
+    sensor = Drift(T, np.ones(40), is_measured=True)
+    near = sensor.nearby(40, reach_m=0.5)
+    assert {0, 1, 5} <= set(near.tolist())
+    assert not {9, 10, 11, 18, 20} & set(near.tolist())
+    assert near.max() < 40
+    lost = Drift(T, np.r_[np.ones(39), 20.0], is_measured=True)  # the last step was tracked by chance
+    assert 9 in lost.nearby(40, reach_m=0.5)
+    np.testing.assert_array_equal(sensor.nearby(0, reach_m=0.5), [])
 
 
 def offered(world: World) -> list[tuple[bool, bool]]:
@@ -131,10 +160,9 @@ def offered(world: World) -> list[tuple[bool, bool]]:
     found: list[tuple[bool, bool]] = []
     apply = world.closer._apply
 
-    def spy(keyframe: MapKeyframe, candidate: int, placement: Placement, scale: float) -> Floats | None:
-        T_loop = world.map.keyframes[candidate].T_camera_world @ invert(placement.T_camera_world)
-        wrong = invert(T_loop) @ invert(true_pose(candidate)) @ true_pose(keyframe.id)
-        scales = apply(keyframe, candidate, placement, scale)
+    def spy(keyframe: MapKeyframe, edge: Edge, placement: Placement) -> Floats | None:
+        wrong = invert(edge.T_i_j) @ invert(true_pose(edge.i)) @ true_pose(keyframe.id)
+        scales = apply(keyframe, edge, placement)
         is_true = rotation_angle_rad(wrong[:3, :3]) < 0.1 and np.linalg.norm(wrong[:3, 3]) < 0.2
         found.append((bool(is_true), scales is not None))
         return scales
@@ -278,7 +306,7 @@ def test_no_loop_between_two_places_that_only_look_alike() -> None:
     world.map.set_depth(impostor, keyframe.prediction.load(), unknown, unknown)
     poses = world.map.T_world_camera
     assert world.closer.close(impostor, world.closer.describe(fake)) is None
-    assert world.closer.candidates(impostor)[:1] == [0]
+    assert world.closer.candidates(impostor)[0][:1] == [0]
     np.testing.assert_array_equal(world.map.T_world_camera, poses)
 
 

@@ -26,7 +26,7 @@ from slamdepth.typing import Floats, Ints
 log = logging.getLogger(__name__)
 
 _ALREADY_LINKED = 15  # shared landmarks that make two keyframes neighbours
-_CANDIDATES = 2
+_CANDIDATES = 2  # of those that look most alike, and of those that odometry allows
 _MIN_SCORE_SHARE = 0.6  # of the similarity of two neighbours in time
 _MIN_VERIFIED = 15  # matches that verification starts from
 _LOOP_SIGMAS = (0.01, 0.02, 0.03)  # radians, metres, natural logarithm of the scale
@@ -87,11 +87,16 @@ class LoopCloser:
         self.places.add_vector(keyframe.id, words)
         if not self._config.loops.enabled:
             return None
-        for candidate in self.candidates(keyframe):
+        alike, allowed = self.candidates(keyframe)
+        for candidate in dict.fromkeys([*alike, *allowed]):
             verified = self.verify(keyframe, candidate)
             if verified is None:
                 continue
-            scales = self._apply(keyframe, candidate, *verified)
+            placement, scale = verified
+            edge = self._edge(keyframe, candidate, placement, scale)
+            if candidate not in alike and not self._drift().explains(edge):
+                continue  # a place that looks alike, where the true one was looked for
+            scales = self._apply(keyframe, edge, placement)
             if scales is not None:
                 if self._is_new(keyframe.id, candidate):
                     self.count += 1
@@ -124,16 +129,32 @@ class LoopCloser:
         gap = self._config.loops.min_gap
         return keyframe - self._last[0] > gap or abs(candidate - self._last[1]) > gap
 
-    def candidates(self, keyframe: MapKeyframe) -> list[int]:
-        """Earlier keyframes that look like ``keyframe`` and share no landmarks with it, best first."""
+    def candidates(self, keyframe: MapKeyframe) -> tuple[list[int], list[int]]:
+        """Earlier keyframes that look like ``keyframe`` and share no landmarks with it, best first.
+
+        Where places look alike, the true one is seldom among the best by appearance.
+
+        Returns:
+            Of all, and of those that may see the same surfaces as far as odometry can have drifted.
+        """
         newest = keyframe.id - self._config.loops.min_gap
         if newest < 0:
-            return []
+            return [], []
         shared = self._map.shared_landmarks(keyframe.landmark_ids)
         exclude = {k for k in range(len(shared)) if k > newest or shared[k] >= _ALREADY_LINKED}
         least = _MIN_SCORE_SHARE * self.places.score(keyframe.id, keyframe.id - 1)
-        answers = self.places.query_keyframe(keyframe.id, exclude=exclude, top_k=_CANDIDATES)
-        return [k for k, score in answers if score >= least]
+        answers = self.places.query_keyframe(keyframe.id, exclude=exclude, top_k=newest + 1)
+        alike = [k for k, score in answers if score >= least]
+        nearby = set(self._drift().nearby(keyframe.id, self._distance_m(keyframe)).tolist())
+        return alike[:_CANDIDATES], [k for k in alike if k in nearby][:_CANDIDATES]
+
+    def _distance_m(self, keyframe: MapKeyframe) -> float:
+        """Median distance of what a keyframe sees."""
+        seen = keyframe.landmark_ids[keyframe.landmark_ids >= 0]
+        if len(seen) == 0:
+            return 0.0
+        offset = self._map.landmarks.position_w[seen] - keyframe.center_w
+        return float(np.median(np.linalg.norm(offset, axis=1)))
 
     def verify(self, keyframe: MapKeyframe, candidate: int) -> tuple[Placement, float] | None:
         """Where ``candidate`` places ``keyframe``, and the ratio of their metres.
@@ -156,26 +177,30 @@ class LoopCloser:
                 scale = float(np.exp(np.median(np.log(there[ok] / here[ok]))))
         return placement, scale
 
-    def _apply(
-        self, keyframe: MapKeyframe, candidate: int, placement: Placement, scale: float
-    ) -> Floats | None:
-        """Correct the map by a verified loop; returns the scales ``(K,)``, None where the loop is refused."""
+    def _edge(self, keyframe: MapKeyframe, candidate: int, placement: Placement, scale: float) -> Edge:
         T_loop = self._map.keyframes[candidate].T_camera_world @ invert(placement.T_camera_world)
-        edge = Edge(candidate, keyframe.id, T_loop, scale, _LOOP_SIGMAS, is_loop=True)
+        return Edge(candidate, keyframe.id, T_loop, scale, _LOOP_SIGMAS, is_loop=True)
+
+    def _drift(self) -> Drift:
+        """How far odometry may have drifted up to now."""
+        shared = self._map.shared_with_next()
+        return Drift(self._map.T_world_camera, weakness(shared), self._map.is_measured)
+
+    def _apply(self, keyframe: MapKeyframe, edge: Edge, placement: Placement) -> Floats | None:
+        """Correct the map by a verified loop; returns the scales ``(K,)``, None where the loop is refused."""
         new = [edge]
         scales = np.ones(len(self._map.keyframes))
         units = self._map.units
-        if _is_off(keyframe, placement, scale):
+        if _is_off(keyframe, placement, edge.scale_i_j):
             T_old, together = self._map.T_world_camera, self._map.covisibility()
             result = self._optimised(T_old, together, new)
             if result is None:
-                drift = Drift(T_old, weakness(np.diagonal(together, 1)), self._map.is_measured)
-                new = self._refused.confirmed(edge, drift)
+                new = self._refused.confirmed(edge, self._drift())
                 result = self._optimised_after_drift(T_old, together, new)
             if result is None:
                 self._refused.add(edge)
                 self.refused += 1
-                log.info("loop %d-%d refused by the pose graph", candidate, keyframe.id)
+                log.info("loop %d-%d refused by the pose graph", edge.i, keyframe.id)
                 return None
             scales = result.scales
             self._map.correct_similarities(result.T_world_camera, scales)

@@ -18,7 +18,7 @@ import numpy as np
 from slamdepth.backend.pose_graph import Edge
 from slamdepth.geometry import invert, rotation_angle_rad
 from slamdepth.loops.edges import STEP_SIGMAS
-from slamdepth.typing import Floats
+from slamdepth.typing import Floats, Ints
 
 _AGREEING = 3  # keyframes that must see the same place
 _REMEMBERED = 12  # keyframes a refused loop is kept for: farther apart, drift hides agreement
@@ -27,6 +27,7 @@ _DRIFT = 3.0  # deviations that odometry may have drifted by
 _STEADY = (0.003, 0.0, 0.003)  # radians, metres and log scale that every step may err by in one direction
 _STEADY_PATH = 0.03  # of the path
 _MEASURED = 0.5  # of all that, where a sensor measures the depth
+_ASIDE = np.pi / 3.0  # between two views of a surface: farther aside its features look different
 
 
 @dataclass(frozen=True)
@@ -48,26 +49,34 @@ class Drift:
         """Of rotation, translation and scale those that may drift."""
         return 2 if self.is_measured else 3
 
-    def bound(self, i: int, j: int) -> tuple[float, float, float]:
-        """What may have been lost from keyframe ``i`` to ``j``: radians, metres, logarithm of the scale.
+    def bounds(self, j: int) -> Floats:
+        """What may have been lost from each earlier keyframe to keyframe ``j``, ``(j, 3)``.
 
-        A random walk over the steps, and a share of the way in one direction.
+        A random walk over the steps, and a share of the way in one direction; radians, metres and logarithm
+        of the scale.
         """
-        weakness, centers = self.weakness[i:j], self.T_world_camera[i : j + 1, :3, 3]
-        walk = _DRIFT * float(np.sqrt(np.sum(weakness**2)))
-        path_m = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
-        factor = _MEASURED if self.is_measured else 1.0
-        rotation, translation, log_scale = (
-            factor * (walk * sigma + steady * (j - i))
-            for sigma, steady in zip(STEP_SIGMAS, _STEADY, strict=True)
-        )
-        return rotation, translation + factor * _STEADY_PATH * path_m, log_scale
+        steps_m = np.linalg.norm(np.diff(self.T_world_camera[: j + 1, :3, 3], axis=0), axis=1)
+        walk = _DRIFT * np.sqrt(_sums_to_end(self.weakness[:j] ** 2))
+        lost = walk[:, None] * STEP_SIGMAS + np.arange(j, 0, -1)[:, None] * _STEADY
+        lost[:, 1] += _STEADY_PATH * _sums_to_end(steps_m)
+        return np.asarray(lost * (_MEASURED if self.is_measured else 1.0))
+
+    def nearby(self, j: int, reach_m: float) -> Ints:
+        """Earlier keyframes that may see what keyframe ``j`` sees, as far as odometry can have drifted.
+
+        Args:
+            reach_m: how far two cameras that see the same surface may be apart.
+        """
+        T, lost = self.T_world_camera, self.bounds(j)
+        apart_m = np.linalg.norm(T[:j, :3, 3] - T[j, :3, 3], axis=1)
+        turned = rotation_angle_rad(np.swapaxes(T[:j, :3, :3], 1, 2) @ T[j, :3, :3])
+        return np.flatnonzero((apart_m <= reach_m + lost[:, 1]) & (turned <= _ASIDE + lost[:, 0]))
 
     def explains(self, edge: Edge) -> bool:
         """Whether the odometry between its keyframes may have drifted as much as a loop says."""
         i, j = sorted((edge.i, edge.j))
         error = _error(edge, self.T_world_camera)[: self.dimensions]
-        return all(e <= bound for e, bound in zip(error, self.bound(i, j), strict=False))
+        return all(e <= bound for e, bound in zip(error, self.bounds(j)[i], strict=False))
 
 
 class RefusedLoops:
@@ -93,6 +102,11 @@ class RefusedLoops:
             other for other in self._edges.values() if other.j != edge.j and _agree(other, edge, drift)
         ]
         return [*agreeing, edge] if len(agreeing) + 1 >= _AGREEING else []
+
+
+def _sums_to_end(values: Floats) -> Floats:
+    """Sum of each value and all after it."""
+    return np.asarray(np.cumsum(values[::-1])[::-1])
 
 
 def _similarity(edge: Edge) -> tuple[Floats, float]:

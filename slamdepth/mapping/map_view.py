@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -71,6 +72,13 @@ class MapView:
         mask = self.mask(ids)
         return np.array(
             [np.count_nonzero(mask[state.landmark_ids]) for state in self._states], dtype=np.int64
+        )
+
+    def shared_with_next(self) -> Ints:
+        """How many landmarks each keyframe but the last shares with the next one, ``(K - 1,)``."""
+        return np.array(
+            [np.count_nonzero(self.mask(a.landmark_ids)[b.landmark_ids]) for a, b in pairwise(self._states)],
+            dtype=np.int64,
         )
 
     def covisibility(self) -> Ints:
