@@ -9,7 +9,8 @@ closed loop is false where the motion it says differs from the true one by more 
 where its two images share no surface. A revisit of an earlier place is found "by loop" where a true loop was
 closed in it, or else by tracking, where half of its keyframes share landmarks with that place. "linked"
 is the share of all keyframes of revisits that do. The error is that of SE(3) with a sensor's depth and of
-Sim(3) else. With --output, finished rows are kept and the same command goes on.
+Sim(3) else. With --inject 0.3, 30 % of the keyframes that look for loops find one with a place they do not
+see. With --output, finished rows are kept and the same command goes on.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import numpy as np
 from benchmarks.command import comma_separated, errors_in_one_line, parser_of, progress_line
 from benchmarks.depth_cache import default_cache
 from benchmarks.loops_closed import closed_loops, covisibility
+from benchmarks.loops_injected import inject_false_loops
 from benchmarks.loops_truth import judge_loops, true_keyframes
 from benchmarks.markdown import markdown_table
 from benchmarks.record import environment
@@ -42,9 +44,11 @@ from slamdepth.synth.sequence import SynthSettings, render_sequence
 from slamdepth.tracking import Tracker
 from slamdepth.typing import Floats32
 
-_KEYS = ("sequence", "depth", "start", "loops")
-_HEADINGS = ("sequence", "depth", "from", "tracked %", "keyframes", "closed", "true", "false", "refused",
-             "revisits", "by loop", "found", "linked %", "error on", "error off", "on/off")  # fmt: skip
+_KEYS = ("sequence", "depth", "start", "loops", "inject")
+_HEADINGS = (
+    "sequence", "depth", "from", "tracked %", "keyframes", "closed", "true", "false", "refused", "injected",
+    "revisits", "by loop", "found", "linked %", "error on", "error off", "on/off",
+)  # fmt: skip
 
 
 def aliased_rooms(seeds: Sequence[int], frames: int, width: int, height: int, work: Path) -> list[Recording]:
@@ -67,8 +71,14 @@ def aliased_rooms(seeds: Sequence[int], frames: int, width: int, height: int, wo
     return rooms
 
 
-def run(recording: Recording, depth: str, start: int, *, with_loops: bool) -> dict[str, Any]:
-    """Track one sequence from frame ``start`` and judge its loops: the figures, or the error."""
+def run(
+    recording: Recording, depth: str, start: int, *, with_loops: bool, injected: float = 0.0
+) -> dict[str, Any]:
+    """Track one sequence from frame ``start`` and judge its loops: the figures, or the error.
+
+    Args:
+        injected: share of the loop decisions that are about a false place.
+    """
     dataset = open_dataset(recording.sequence, recording.camera_file)
     config = Config.from_dict({"depth": {"name": depth}, "loops": {"enabled": with_loops}})
     begun = time.perf_counter()
@@ -78,6 +88,7 @@ def run(recording: Recording, depth: str, start: int, *, with_loops: bool) -> di
     frames = range(start, len(dataset))
     try:
         with Tracker(dataset.camera, model, config) as tracker:
+            false_loops = inject_false_loops(tracker, injected, start) if injected else None
             for index in frames:
                 tracker.step(dataset.read(index, with_depth=depth == "sensor"))
             found = tracker.finish()
@@ -106,6 +117,7 @@ def run(recording: Recording, depth: str, start: int, *, with_loops: bool) -> di
         "loop_closures": found.statistics.loop_closures,
         **judged,
         "refused": found.statistics.loops_refused,
+        "injected": len(false_loops.pairs) if false_loops else 0,
         "ate": max(errors, default=None),
         "wall_s": wall_s,
     }
@@ -125,9 +137,20 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     with_loops = [row for row in rows if row["loops"] == "on"]
     cells = [_cells(on, _without(rows, on)) for on in with_loops]
     good = [row for row in with_loops if "error" not in row]
-    names = ("closed", "true", "false", "refused", "revisits", "by_loop", "found", "linked", "seen_again")
+    names = (
+        "closed",
+        "true",
+        "false",
+        "refused",
+        "injected",
+        "revisits",
+        "by_loop",
+        "found",
+        "linked",
+        "seen_again",
+    )
     total = {name: sum(row[name] for row in good) for name in names}
-    counts = [str(total[name]) for name in names[:7]]
+    counts = [str(total[name]) for name in names[:8]]
     ratios = [ratio for on in good if (ratio := _ratio(on, _without(rows, on))) is not None]
     worst = f"{max(ratios):.2f} at most" if ratios else "-"
     cells.append(
@@ -157,7 +180,7 @@ def _cells(on: dict[str, Any], off: dict[str, Any]) -> list[str]:
     ratio = _ratio(on, off)
     return [
         *names, f"{100 * on['tracked']:.1f}", str(on["keyframes"]), str(on["closed"]), str(on["true"]),
-        str(on["false"]), str(on["refused"]), str(on["revisits"]), str(on["by_loop"]),
+        str(on["false"]), str(on["refused"]), str(on["injected"]), str(on["revisits"]), str(on["by_loop"]),
         str(on["found"]),
         _percent(on["linked"], on["seen_again"]), *errors, "-" if ratio is None else f"{ratio:.2f}",
     ]  # fmt: skip
@@ -183,6 +206,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="with commas (default: sensor,dinov2)")  # fmt: skip
     add("--starts", type=_whole_numbers, default=[0], metavar="N,...", help="first frames (default: 0)")
     add("--work", type=Path, default=default_cache(), metavar="DIR", help="folder of the rendered rooms")
+    add("--inject", type=float, default=0.0, metavar="SHARE",
+        help="share of the loop decisions that are about a false place (default: 0)")  # fmt: skip
     add("--output", "-o", type=Path, metavar="FILE", help="write the figures as JSON")
     return parser.parse_args(arguments)
 
@@ -206,10 +231,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 continue
             for start in asked.starts:
                 for loops in ("on", "off"):
-                    key = {"sequence": recording.name, "depth": depth, "start": start, "loops": loops}
+                    key = {"sequence": recording.name, "depth": depth, "start": start, "loops": loops,
+                           "inject": asked.inject}  # fmt: skip
                     row = file.find(**key)
                     if row is None:
-                        row = {**key, **run(recording, depth, start, with_loops=loops == "on")}
+                        row = {
+                            **key,
+                            **run(recording, depth, start, with_loops=loops == "on", injected=asked.inject),
+                        }
                         file.add(row)
                         progress_line(f"{recording.name} [{depth}] from {start}, loops {loops}: done")
                     rows.append(row)

@@ -22,6 +22,10 @@ FALSE_M, FALSE_DEG = 0.3, 10.0
 LINKED = 15
 """Shared landmarks that tie two keyframes."""
 
+ASIDE_DEG = 60.0
+"""Views turned by more than this are no revisit: no tracker expects a landmark there, and ORB features, which
+bear about 30 degrees, do not match. A hall seen from its other end shares surfaces, but no view."""
+
 _WITHIN_S = 0.02
 _MERGED_GAP = 2  # keyframes: shorter gaps do not end a revisit
 
@@ -62,6 +66,8 @@ class TrueKeyframes:
     def same_earlier(self, min_gap: int, least: float) -> Bools:
         """``(K, K)`` True at ``[i, j]`` where j sees the place of i again, after a view of another place.
 
+        Only from less than :data:`ASIDE_DEG` aside.
+
         Args:
             min_gap: keyframes from i to j, at least.
             least: overlap of i and j, at least.
@@ -73,6 +79,10 @@ class TrueKeyframes:
             if len(elsewhere):
                 found[: elsewhere[-1], j] = self.overlap[: elsewhere[-1], j] >= least
             found[max(0, j - min_gap + 1) :, j] = False
+            turned = rotation_angle_rad(
+                np.swapaxes(self.T_world_camera[:j, :3, :3], 1, 2) @ self.T_world_camera[j, :3, :3]
+            )
+            found[:j, j] &= turned <= np.radians(ASIDE_DEG)
         return found
 
 

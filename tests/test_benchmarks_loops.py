@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ring_world import TURN, World
 
 from benchmarks import loops
 from benchmarks.loops_closed import ClosedLoop, closed_loops, covisibility
+from benchmarks.loops_injected import FalseLoops
 from benchmarks.loops_truth import TrueKeyframes, judge_loops, runs, true_keyframes
 from slamdepth.datasets import open_dataset
 from slamdepth.depth.sensor import SensorDepth
@@ -78,6 +80,17 @@ def test_a_place_is_seen_again_only_after_another_one() -> None:
     assert not truth.same_earlier(8, 0.3).any()
 
 
+def test_a_hall_seen_from_its_other_end_is_no_revisit() -> None:
+    times_s, T = np.arange(4.0), before_a_wall(0.0, 5.0, 0.0, 0.3)
+    opposite = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(70.0), 0.0]))
+    T[2] = T[2] @ opposite  # the wall at its back may be in view by its depth alone
+    truth = true_keyframes(
+        times_s, T, [Trajectory(times_s, T)], CAMERA, [WALL] * 4, is_metric=True, depth_is_true=True
+    )
+    seen = TrueKeyframes(truth.piece, T, 1.0, truth.limit, np.array([[1, 0, 1, 1], [0, 1, 0, 0]] * 2))
+    assert seen.same_earlier(1, 0.3)[0].tolist() == [False, False, False, True]
+
+
 def test_true_false_and_missed_loops_are_counted() -> None:
     there_and_back = (0.0, 0.5, 5.0, 9.0, 0.2, 0.4, 9.0, 5.0)
     truth = truth_of(*there_and_back)
@@ -89,6 +102,20 @@ def test_true_false_and_missed_loops_are_counted() -> None:
     assert (found["by_loop"], found["found"]) == (1, 1)
     missed = judge_loops([loop(2, 4, 0.1)], truth, nothing, min_gap=2)
     assert (missed["by_loop"], missed["found"], missed["linked"]) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("is_sensor", [True, False])
+def test_injected_false_loops_are_offered_as_often_as_asked_and_refused(is_sensor: bool) -> None:
+    world = World(TURN - 1, turn_drift=0.002, is_sensor=is_sensor, alone=True)
+    false = FalseLoops(world.closer, world.map, 0.5, seed=0)
+    for _ in range(TURN):
+        world.grow()
+    assert 5 <= len(false.pairs) <= 13
+    closed = {(loop.edge.i, loop.edge.j) for loop in world.closer._loops}
+    assert closed
+    assert not closed & set(false.pairs)
+    assert world.closer.refused >= len(false.pairs)
+    assert world.turn_errors_rad().max() < 0.04
 
 
 def test_tracking_finds_a_revisit_by_shared_landmarks() -> None:
