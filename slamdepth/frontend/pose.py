@@ -280,6 +280,42 @@ class _Matches:
         return J
 
 
+def corner_deviation_px(
+    camera: Camera, T_camera_world: Floats, points_w: Floats, information: Floats
+) -> float:
+    """How far, in pixels, an uncertain pose misplaces points in that corner of the image where it errs most.
+
+    Landmarks in one half of the image tell a turn from a shift badly; in the other half the two differ.
+
+    Args:
+        T_camera_world: ``(4, 4)``; points_w: ``(N, 3)`` m that it was estimated from. Points of their median
+            depth are considered.
+        information: ``(6, 6)``, see :class:`PoseEstimate`.
+
+    Returns:
+        The largest standard deviation in any direction; infinity where the pose is not determined.
+    """
+    z = float(np.median((points_w @ T_camera_world[2, :3]) + T_camera_world[2, 3])) if len(points_w) else 0.0
+    if z <= _NEAREST_M:
+        return np.inf
+    try:
+        covariance = np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        return np.inf
+    u, v = (axis.ravel() for axis in np.meshgrid([0.0, camera.width - 1.0], [0.0, camera.height - 1.0]))
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    zero, one = np.zeros(4), np.ones(4)
+    along_u = camera.fx * np.stack([one / z, zero, -x / z, -x * y, 1.0 + x * x, -y])
+    along_v = camera.fy * np.stack([zero, one / z, -y / z, -1.0 - y * y, x * y, x])
+    weighted_u, weighted_v = covariance @ along_u, covariance @ along_v
+    S00, S01, S11 = (
+        (a * b).sum(axis=0) for a, b in ((along_u, weighted_u), (along_u, weighted_v), (along_v, weighted_v))
+    )
+    half_trace = 0.5 * (S00 + S11)
+    largest = float((half_trace + np.sqrt(np.maximum(half_trace**2 - (S00 * S11 - S01**2), 0.0))).max())
+    return float(np.sqrt(largest)) if largest > 0.0 else np.inf
+
+
 def pose_from_scratch(
     camera: Camera, points_w: Floats, px: Floats, *, seed: int, threshold_px: float = 6.0, minimum: int = 12
 ) -> tuple[Floats, NDArray[np.bool_]] | None:

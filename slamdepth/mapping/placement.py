@@ -29,12 +29,14 @@ class Placement:
         landmark_ids: ``(N,)`` landmark each feature agrees with, -1 for none.
         expected_ids: ``(M,)`` landmarks that should be seen from there.
         placed_by: how it was found.
+        is_loose: in some corner of the image the pose errs by more than the search for landmarks allows for.
     """
 
     T_camera_world: Floats
     landmark_ids: Ints
     expected_ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     placed_by: PlacedBy = PlacedBy.MOTION
+    is_loose: bool = False
 
     @property
     def inliers(self) -> int:

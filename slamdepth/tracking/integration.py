@@ -97,6 +97,11 @@ class KeyframeIntegration:
         return sum(not waiting.has_landmarks for waiting in self._waiting) >= _MAX_WAITING
 
     @property
+    def awaits_landmarks(self) -> bool:
+        """Whether a keyframe has not created its landmarks yet."""
+        return any(not waiting.has_landmarks for waiting in self._waiting)
+
+    @property
     def is_due(self) -> bool:
         """Whether the next stage of the oldest waiting keyframe may run."""
         return bool(self._waiting) and self._waiting[0].frames_left <= 0

@@ -49,7 +49,8 @@ class KeyframePolicy:
         enough = tracking.keyframe_overlap_start if starting else tracking.keyframe_overlap
         if seen < enough * self._overlap:
             return starting or not self._is_known_ground(placement)
-        return placement.inliers < tracking.keyframe_min_inliers and seen < 0.9 * self._overlap
+        is_weak = placement.inliers < tracking.keyframe_min_inliers or placement.is_loose
+        return is_weak and seen < 0.9 * self._overlap
 
     def _is_known_ground(self, placement: Placement) -> bool:
         """Whether one earlier keyframe, or three together, show what the frame sees.

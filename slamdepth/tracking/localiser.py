@@ -10,7 +10,13 @@ import numpy as np
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features, ScaleLevels
 from slamdepth.frontend.matching import best_matches
-from slamdepth.frontend.pose import pixel_covariance, pose_from_scratch, refine_pose
+from slamdepth.frontend.pose import (
+    PoseEstimate,
+    corner_deviation_px,
+    pixel_covariance,
+    pose_from_scratch,
+    refine_pose,
+)
 from slamdepth.geometry import CHI2_2DOF_99, project, transform
 from slamdepth.mapping.map_view import NEAREST_M, MapView
 from slamdepth.mapping.placement import PlacedBy, Placement
@@ -19,6 +25,7 @@ from slamdepth.typing import Floats, Ints
 
 _FEWEST_SURE = 40
 _LEAST_SURE_SHARE = 0.07
+_POSE_PX = 4.0  # that a pose errs by at most where the local map is searched
 
 
 @dataclass(frozen=True)
@@ -165,10 +172,10 @@ class Localiser:
         """
         ids = self.local_ids(start.landmark_ids)
         visible = self.expected(start.T_camera_world, ids)
-        found, at, _ = self.search(visible, features, 4.0, 30.0)
+        found, at, _ = self.search(visible, features, _POSE_PX, 30.0)
         if len(found) < self._config.tracking.min_inliers:
             return None
-        placement = self._solve(features, start.T_camera_world, found, at)
+        placement = self._solve(features, start.T_camera_world, found, at, is_judged=True)
         if placement.inliers < self._config.tracking.min_inliers:
             return None
         share = placement.inliers / len(visible.ids)
@@ -181,7 +188,8 @@ class Localiser:
         at = np.flatnonzero(placement.landmark_ids >= 0)
         if len(at) < self._config.tracking.min_inliers:
             return placement
-        refined = self._solve(features, placement.T_camera_world, placement.landmark_ids[at], at, rounds=2)
+        ids = placement.landmark_ids[at]
+        refined = self._solve(features, placement.T_camera_world, ids, at, rounds=2, is_judged=True)
         if refined.inliers < self._config.tracking.min_inliers:
             return placement
         return replace(refined, placed_by=placement.placed_by)
@@ -199,19 +207,48 @@ class Localiser:
         seeds = landmark_ids[landmark_ids >= 0]
         return self._map.seen_from(self._map.covisible(seeds, self._config.tracking.local_keyframes))
 
-    def _solve(self, features: Features, T_start: Floats, ids: Ints, at: Ints, rounds: int = 4) -> Placement:
+    def _solve(
+        self,
+        features: Features,
+        T_start: Floats,
+        ids: Ints,
+        at: Ints,
+        rounds: int = 4,
+        *,
+        is_judged: bool = False,
+    ) -> Placement:
         estimate = refine_pose(
             self._camera,
             T_start,
             self._map.landmarks.position_w[ids],
-            self._map.landmarks.covariance_w[ids],
+            self._covariance_w(ids),
             features.px[at],
             features.sigma_px[at],
             rounds=rounds,
         )
         landmark_ids = np.full(len(features), -1, dtype=np.int64)
         landmark_ids[at[estimate.inliers]] = ids[estimate.inliers]
-        return Placement(estimate.T_camera_world, landmark_ids)
+        placement = Placement(estimate.T_camera_world, landmark_ids)
+        return replace(placement, is_loose=self._is_loose(placement, estimate)) if is_judged else placement
+
+    def _covariance_w(self, ids: Ints) -> Floats:
+        """Covariance ``(N, 3, 3)`` of landmarks by which a pose may weigh them, m^2.
+
+        Landmarks that only one keyframe sees share the error of its pose and of its predicted depth, where a
+        tilted wall passes for a turned camera. Hundreds of them are no hundred measurements. So they count
+        for less, as predicted depths do in bundle adjustment.
+        """
+        landmarks = self._map.landmarks
+        covariance = landmarks.covariance_w[ids]
+        if self._map.is_measured:
+            return covariance
+        covariance[landmarks.observations[ids] < 2] *= self._config.bundle.prior_inflation**2
+        return covariance
+
+    def _is_loose(self, placement: Placement, estimate: PoseEstimate) -> bool:
+        found_w = self._map.landmarks.position_w[placement.found_ids]
+        errs_px = corner_deviation_px(self._camera, placement.T_camera_world, found_w, estimate.information)
+        return bool(errs_px * np.sqrt(CHI2_2DOF_99) > _POSE_PX)
 
     def from_keyframe(
         self, features: Features, keyframe_id: int, *, minimum: int | None = None, is_lost: bool = False

@@ -190,6 +190,8 @@ class MapTracker:
     ) -> Placed:
         """Add a placed frame to the log, and to the map where the view has moved on."""
         follows_motion = self.motion.is_known
+        if placement.is_loose and self.integration.awaits_landmarks:
+            placement = self._place_in_grown_map(features, placement)
         is_keyframe = self.integration.wants(placement) and self._workers.depth.has_depth(frame)
         is_keyframe &= not self.check.is_provisional
         if is_keyframe and self.integration.is_full:
