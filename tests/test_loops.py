@@ -111,7 +111,24 @@ def test_identical_desks_are_not_joined_however_many_keyframes_agree(is_sensor: 
         seen[0, 3] -= 2.0
         edge = Edge(n, 60 + n, seen, is_loop=True)
         assert refused.confirmed(edge, drift) == []
-        refused.add(edge)
+        refused.add(edge, drift)
+
+
+def test_false_loops_of_a_keyframe_do_not_push_out_the_true_one() -> None:
+    """Of identical desks the false one is often verified first."""
+    T = np.tile(np.eye(4), (70, 1, 1))
+    T[:, 0, 3] = 0.1 * np.arange(70)
+    refused, drift = RefusedLoops(), Drift(T, np.ones(69), is_measured=False)
+    confirmed: list[Edge] = []
+    for n in range(3):
+        for off_m in (-2.5, 0.6):  # the other desk; the true place, after a drift
+            seen = invert(T[n]) @ T[60 + n]
+            seen[0, 3] += off_m
+            edge = Edge(n, 60 + n, seen, is_loop=True)
+            confirmed = refused.confirmed(edge, drift)
+            refused.add(edge, drift)
+    assert [edge.j for edge in confirmed] == [60, 61, 62]
+    np.testing.assert_allclose([edge.T_i_j[0, 3] for edge in confirmed], 6.6)
 
 
 def test_odometry_drifts_more_over_weak_steps_and_less_with_a_sensor() -> None:

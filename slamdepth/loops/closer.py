@@ -195,10 +195,11 @@ class LoopCloser:
             T_old, together = self._map.T_world_camera, self._map.covisibility()
             result = self._optimised(T_old, together, new)
             if result is None:
-                new = self._refused.confirmed(edge, self._drift())
+                drift = self._drift()
+                new = self._refused.confirmed(edge, drift)
                 result = self._optimised_after_drift(T_old, together, new)
             if result is None:
-                self._refused.add(edge)
+                self._refused.add(edge, drift)
                 self.refused += 1
                 log.info("loop %d-%d refused by the pose graph", edge.i, keyframe.id)
                 return None

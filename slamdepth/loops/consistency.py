@@ -80,15 +80,16 @@ class Drift:
 
 
 class RefusedLoops:
-    """The loops refused lately, the best one of each keyframe."""
+    """The loops refused lately that a drift of odometry would explain."""
 
     def __init__(self) -> None:
-        self._edges: dict[int, Edge] = {}
+        self._edges: list[Edge] = []
 
-    def add(self, edge: Edge) -> None:
-        """Remember a refused loop unless its keyframe has one."""
-        self._edges = {j: e for j, e in self._edges.items() if j > edge.j - _REMEMBERED}
-        self._edges.setdefault(edge.j, edge)
+    def add(self, edge: Edge, drift: Drift) -> None:
+        """Remember a refused loop, unless no drift explains it: then nothing can confirm it."""
+        self._edges = [e for e in self._edges if e.j > edge.j - _REMEMBERED]
+        if drift.explains(edge):
+            self._edges.append(edge)
 
     def clear(self) -> None:
         """Drop all, after the map was corrected."""
@@ -98,10 +99,11 @@ class RefusedLoops:
         """The loops that agree with ``edge``, itself last; empty where too few do or no drift explains it."""
         if not drift.explains(edge):
             return []
-        agreeing = [
-            other for other in self._edges.values() if other.j != edge.j and _agree(other, edge, drift)
-        ]
-        return [*agreeing, edge] if len(agreeing) + 1 >= _AGREEING else []
+        agreeing: dict[int, Edge] = {}  # one of each keyframe
+        for other in self._edges:
+            if other.j != edge.j and _agree(other, edge, drift):
+                agreeing.setdefault(other.j, other)
+        return [*agreeing.values(), edge] if len(agreeing) + 1 >= _AGREEING else []
 
 
 def _sums_to_end(values: Floats) -> Floats:
