@@ -96,12 +96,20 @@ class RefusedLoops:
         self._edges.clear()
 
     def confirmed(self, edge: Edge, drift: Drift) -> list[Edge]:
-        """The loops that agree with ``edge``, itself last; empty where too few do or no drift explains it."""
+        """The loops that agree with ``edge``, itself last.
+
+        Returns:
+            Empty where too few agree, or no drift explains the loop, or one explains a rival as well: where
+            odometry allows two places that look alike, nothing tells which one was seen.
+        """
         if not drift.explains(edge):
             return []
         agreeing: dict[int, Edge] = {}  # one of each keyframe
         for other in self._edges:
-            if other.j != edge.j and _agree(other, edge, drift):
+            if not _agree(other, edge, drift):
+                if drift.explains(other):
+                    return []
+            elif other.j != edge.j:
                 agreeing.setdefault(other.j, other)
         return [*agreeing.values(), edge] if len(agreeing) + 1 >= _AGREEING else []
 
