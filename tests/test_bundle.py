@@ -211,6 +211,18 @@ def test_a_common_depth_error_goes_into_the_scale_of_its_keyframe() -> None:
     )
 
 
+def test_one_prediction_wrong_by_any_factor_does_not_shrink_the_map() -> None:
+    exact = truth()
+    few = replace(exact, sigma_log=np.full(len(exact.px), 1.5), sigma_scale=0.1)
+    errors = []
+    for factor in (1.5, 20.0):  # a city predicted at three metres
+        wrong = exact.log_depth - np.log(factor) * (exact.obs_camera == 3)
+        problem = replace(noisy(perturbed(few), 1.0), log_depth=wrong)
+        result = bundle_adjust(problem, iterations=(10, 10))
+        errors.append(pose_error(result.T_camera_world, exact.T_camera_world))
+    assert errors[1] < 1.2 * errors[0]
+
+
 def test_depth_gives_the_scale_where_one_camera_is_fixed() -> None:
     exact = truth()
     one = replace(exact, fixed=np.arange(6) == 0, sigma_log=np.full(len(exact.px), 0.02))

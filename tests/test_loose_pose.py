@@ -17,6 +17,7 @@ from slamdepth.mapping.map import Map
 from slamdepth.mapping.placement import Placement
 from slamdepth.tracking.keyframe_policy import KeyframePolicy
 from slamdepth.tracking.localiser import Localiser
+from slamdepth.tracking.view_change import ViewChange
 from slamdepth.typing import Floats
 
 
@@ -66,7 +67,7 @@ def test_a_loosely_placed_frame_becomes_a_keyframe_once_some_of_the_last_one_is_
         keyframe = add_keyframe(map_, count=300)
         if k == 8:
             create(map_, keyframe, range(300))
-    policy = KeyframePolicy(CONFIG, map_)
+    policy = KeyframePolicy(CONFIG, map_, ViewChange(map_))
     seen = keyframe.landmark_ids.copy()
     whole = Placement(np.eye(4), seen)
     fewer = Placement(np.eye(4), np.where(np.arange(300) < 250, seen, -1))

@@ -5,7 +5,7 @@ Minimises, over poses, points and one log scale ``a_k`` per keyframe,
 
     sum  rho(|pi(T_k X_p) - u_kp|^2 / s_kp^2)              reprojection, Huber
        + sum  rho_c((log z_kp - a_k - log d_kp)^2 / t_kp^2)   depth prior, Cauchy
-       + sum  a_k^2 / s_a^2                                   a keyframe's common depth error
+       + sum  rho_c(a_k^2 / s_a^2)                            a keyframe's common depth error, Cauchy
 
 and, where the shutter may roll, over the readout time ``r`` common to all images, which
 moves a pixel ``u`` by ``r du/dr`` (``BundleProblem.px_rate``);

@@ -20,6 +20,7 @@ from slamdepth.typing import Bools, Floats
 
 HUBER = 1.5
 CAUCHY = 2.0
+SCALE_CAUCHY = 2.0
 MIN_DEPTH_M = 0.01
 _CAM = 7  # translation, rotation, log depth scale
 _DENSE_LIMIT = 4_000_000  # numbers in the camera-point block before it is kept sparse
@@ -79,6 +80,7 @@ class Solver:
         scaled = np.zeros(len(problem.fixed), dtype=bool)
         if problem.sigma_scale > 0:
             scaled[self.cam[has]] = True
+        self._scale_knee = SCALE_CAUCHY * problem.sigma_scale
         self.free = np.flatnonzero(~problem.fixed | scaled)
         self.pinned = problem.fixed[self.free]
         self.P, self.K = len(problem.points_w), len(self.free)
@@ -134,7 +136,7 @@ class Solver:
         depth = CAUCHY * CAUCHY * np.log1p((r[2] / CAUCHY) ** 2)
         total = float(pixel.sum() + depth.sum())
         if self.problem.sigma_scale > 0:
-            total += float(np.sum((state.a / self.problem.sigma_scale) ** 2))
+            total += float(np.sum(SCALE_CAUCHY**2 * np.log1p((state.a / self._scale_knee) ** 2)))
         return total
 
     def _point_blocks(
@@ -195,8 +197,10 @@ class Solver:
                 Hrc[slot] = np.einsum("irn,rn->i", Jc[:, :2, block], Jr[:, block])
         Hcc[np.flatnonzero(self.pinned)[:, None], np.arange(6), np.arange(6)] += 1.0
         if sigma_scale > 0:
-            Hcc[:, 6, 6] += 1.0 / sigma_scale**2
-            bc[:, 6] += state.a[self.free] / sigma_scale**2
+            a = state.a[self.free]
+            pull = 1.0 / sigma_scale**2 / (1.0 + (a / self._scale_knee) ** 2)
+            Hcc[:, 6, 6] += pull
+            bc[:, 6] += a * pull
         else:
             Hcc[:, 6, 6] += 1.0
         border = None

@@ -90,6 +90,7 @@ class Atlas:
         if frame.timestamp_s - self._lost_since_s < self._patience_s():
             return None
         map_ = self._make(self._started)
+        map_.view_change.is_large = self.active.view_change.is_large
         placed = map_.start(frame, raw)
         if placed is None:
             return None

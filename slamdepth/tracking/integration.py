@@ -80,7 +80,8 @@ class KeyframeIntegration:
         self.mapper = LocalMapper(camera, config, map_, localiser)
         self.adjuster = Adjuster(camera, config, map_, shutter, workers.side)
         self.loops = LoopCloser(config, map_, localiser)
-        self._policy = KeyframePolicy(config, map_)
+        self._view_change = localiser.view_change
+        self._policy = KeyframePolicy(config, map_, localiser.view_change)
         self._waiting: list[_Waiting] = []  # oldest first
         self.gravity = GravityConsensus()
         self._complete: list[MapKeyframe] = []
@@ -137,7 +138,7 @@ class KeyframeIntegration:
         waiting = _Waiting(keyframe, delay, iter(()))
         waiting.stages = self._stages(waiting, words)
         self._waiting.append(waiting)
-        if len(self._map.keyframes) <= _WAITED_FOR:
+        if len(self._map.keyframes) <= _WAITED_FOR or self._view_change.is_large:
             self.run_all()
         return keyframe
 

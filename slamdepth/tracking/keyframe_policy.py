@@ -10,10 +10,12 @@ from slamdepth.geometry import rotation_angle_rad
 from slamdepth.mapping.map_keyframe import MapKeyframe
 from slamdepth.mapping.map_view import MapView
 from slamdepth.mapping.placement import Placement
+from slamdepth.tracking.view_change import ViewChange
 
 _START_KEYFRAMES = 8  # until then most landmarks are known by a predicted depth only
 _SHOWN_BY_ONE = 0.5  # of an earlier keyframe's landmarks that three keyframes see, seen again
 _SHOWN_BY_THREE = 0.7  # of the landmarks a frame sees, seen by three earlier keyframes
+_WIDE_CHANGE = 0.05  # between keyframes of a camera that takes large steps
 _REGISTERED_STEP_M, _REGISTERED_TURN_RAD = 0.1, 0.15  # between keyframes without features
 
 
@@ -24,9 +26,10 @@ class KeyframePolicy:
     going back and forth makes no new keyframes (after ORB-SLAM's reference keyframe).
     """
 
-    def __init__(self, config: Config, map_: MapView) -> None:
+    def __init__(self, config: Config, map_: MapView, view_change: ViewChange) -> None:
         self._config = config
         self._map = map_
+        self._view_change = view_change
         self._reference: MapKeyframe | None = None  # an earlier keyframe that shows the same
         self._overlap = 0.0  # most landmarks of the reference that a frame saw
         self._seen = 0  # those the last frame saw
@@ -43,6 +46,11 @@ class KeyframePolicy:
             # registered: worth a keyframe where there are features to go on with, or new surfaces
             many = len(placement.landmark_ids) >= tracking.keyframe_min_inliers
             return many or self._has_moved_on(placement, reference)
+        if self._view_change.is_large:
+            # what the next frame will see of this one is not known: nothing is left out
+            last = self._map.keyframes[-1].T_camera_world
+            change = self._view_change.change(last, placement.T_camera_world, placement.landmark_ids)
+            return change is not None and change > _WIDE_CHANGE
         if self._overlap < tracking.min_inliers:
             return True  # the last keyframe saw too little to measure by
         starting = len(self._map.keyframes) < _START_KEYFRAMES

@@ -139,13 +139,14 @@ class LocalMapper:
         For a new landmark the search area is the part of its epipolar line that its predicted depth
         allows; a match is its first triangulation.
         """
+        max_px = self._camera.width / 4 if self._localiser.view_change.is_large else 60.0
         for k in neighbours:
             other = self._map.keyframes[k]
             mine = np.unique(keyframe.landmark_ids[keyframe.landmark_ids >= 0])
             ids = mine[~self._map.mask(other.landmark_ids)[mine]]
             visible = self._localiser.expected(other.T_camera_world, ids)
             ids, at, _ = self._localiser.search(
-                visible, other.features, 2.5, 60.0, is_strict=True, ratio=0.75, sigmas=2.5
+                visible, other.features, 2.5, max_px, is_strict=True, ratio=0.75, sigmas=2.5
             )
             self._map.observe(other, at, ids)
 

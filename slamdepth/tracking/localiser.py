@@ -17,9 +17,11 @@ from slamdepth.frontend.pose import (
     pose_from_scratch,
     refine_pose,
 )
+from slamdepth.frontend.wide_pose import Sighting, directional_pose, pose_from_reference
 from slamdepth.geometry import CHI2_2DOF_99, project, transform
 from slamdepth.mapping.map_view import NEAREST_M, MapView
 from slamdepth.mapping.placement import PlacedBy, Placement
+from slamdepth.tracking.view_change import ViewChange
 from slamdepth.types import Camera
 from slamdepth.typing import Floats, Ints
 
@@ -50,6 +52,9 @@ class Localiser:
 
     Args:
         levels: of the extractor whose features it is given; None takes ORB's.
+
+    Attributes:
+        view_change: whether the camera takes large steps, which decides how poses are estimated.
     """
 
     def __init__(
@@ -59,6 +64,7 @@ class Localiser:
         self._config = config
         self._map = map_
         self._levels = levels or ScaleLevels(config.features.scale_factor, config.features.levels)
+        self.view_change = ViewChange(map_)
 
     def expected(self, T_camera_world: Floats, ids: Ints) -> Visible:
         """Which of the landmarks ``ids (N,)`` a camera at ``T_camera_world (4, 4)`` should see, and where."""
@@ -217,15 +223,18 @@ class Localiser:
         *,
         is_judged: bool = False,
     ) -> Placement:
-        estimate = refine_pose(
-            self._camera,
-            T_start,
-            self._map.landmarks.position_w[ids],
-            self._covariance_w(ids),
-            features.px[at],
-            features.sigma_px[at],
-            rounds=rounds,
-        )
+        if self.view_change.is_large:
+            estimate, _ = directional_pose(self._camera, T_start, self._sighting(features, ids, at))
+        else:
+            estimate = refine_pose(
+                self._camera,
+                T_start,
+                self._map.landmarks.position_w[ids],
+                self._covariance_w(ids),
+                features.px[at],
+                features.sigma_px[at],
+                rounds=rounds,
+            )
         landmark_ids = np.full(len(features), -1, dtype=np.int64)
         landmark_ids[at[estimate.inliers]] = ids[estimate.inliers]
         placement = Placement(estimate.T_camera_world, landmark_ids)
@@ -250,6 +259,12 @@ class Localiser:
         errs_px = corner_deviation_px(self._camera, placement.T_camera_world, found_w, estimate.information)
         return bool(errs_px * np.sqrt(CHI2_2DOF_99) > _POSE_PX)
 
+    def _sighting(self, features: Features, ids: Ints, at: Ints) -> Sighting:
+        landmarks = self._map.landmarks
+        return Sighting(
+            landmarks.position_w[ids], landmarks.covariance_w[ids], features.px[at], features.sigma_px[at]
+        )
+
     def from_keyframe(
         self, features: Features, keyframe_id: int, *, minimum: int | None = None, is_lost: bool = False
     ) -> Placement | None:
@@ -266,13 +281,23 @@ class Localiser:
             return None
         a, b = keyframe.features.match(features, has, ratio=0.85)
         ids = keyframe.landmark_ids[has[a]]
-        solution = pose_from_scratch(
-            self._camera,
-            self._map.landmarks.position_w[ids],
-            features.px[b],
-            seed=self._config.seed,
-            minimum=max(8, need // 2),
-        )
+        if self.view_change.is_large:
+            solution = pose_from_reference(
+                self._camera,
+                keyframe.T_camera_world,
+                keyframe.features.px[has[a]],
+                self._sighting(features, ids, b),
+                seed=self._config.seed,
+                minimum=max(8, need // 2),
+            )
+        else:
+            solution = pose_from_scratch(
+                self._camera,
+                self._map.landmarks.position_w[ids],
+                features.px[b],
+                seed=self._config.seed,
+                minimum=max(8, need // 2),
+            )
         if solution is None:
             return None
         T, inliers = solution
@@ -280,4 +305,16 @@ class Localiser:
         if start.inliers < max(8, need // 2):
             return None
         placement = self.refine_in_local_map(features, start, is_lost=is_lost)
-        return None if placement is None else replace(placement, placed_by=PlacedBy.LAST_KEYFRAME)
+        if placement is None:
+            return None
+        if self.view_change.is_large:  # directions are not where the map has them: the search missed them
+            placement = replace(placement, landmark_ids=_united(placement.landmark_ids, start.landmark_ids))
+        return replace(placement, placed_by=PlacedBy.LAST_KEYFRAME)
+
+
+def _united(first: Ints, second: Ints) -> Ints:
+    """Landmarks ``(N,)`` of ``first``, and those of ``second`` where it has none and that it has nowhere."""
+    both: Ints = np.array(first)
+    more = (first < 0) & (second >= 0) & ~np.isin(second, first[first >= 0])
+    both[more] = second[more]
+    return both

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,6 +60,7 @@ class MapTracker:
         id_: number of the map in its run.
         levels: pyramid levels of the extractor.
         workers, watch: shared by the maps of a run.
+        wide_features: finds more features of a frame, for a search over a wide baseline.
 
     Attributes:
         id: number of the map, from 0 in the order of their start.
@@ -75,17 +76,20 @@ class MapTracker:
         levels: ScaleLevels,
         workers: Workers,
         watch: Stopwatch,
+        wide_features: Callable[[Frame], Features],
     ) -> None:
         self.id = id_
         self._config = config
         self._workers = workers
         self._watch = watch
+        self._wide_features = wide_features
         self.map = Map(config.map.keyframe_memory_mib)
         self.frames = FrameLog(camera, self.map)
         self.motion = MotionModel()
         self.shutter = RollingShutter(camera, config.shutter, self.map)
         self.localiser = Localiser(camera, config, self.map, levels)
         self.check = PoseCheck(camera, self.map, self.localiser)
+        self.view_change = self.localiser.view_change
         self.integration = KeyframeIntegration(
             camera,
             config,
@@ -108,6 +112,8 @@ class MapTracker:
 
     def start(self, frame: Frame, features: Features) -> Placed | None:
         """Start the map with a frame; None where its depth does not create enough landmarks."""
+        if self.view_change.is_large:
+            features = self._wide_features(frame)
         need = self._config.tracking.min_inliers
         depth = self._workers.depth
         if len(features) < need or not depth.has_depth(frame):
@@ -126,14 +132,20 @@ class MapTracker:
             None where the camera is lost.
         """
         self._compact()
+        if self.view_change.is_large:
+            raw = self._wide_features(frame)
         with self._watch.timed("tracking"):
             features = self.shutter.correct_by_motion(raw, self.motion, frame.timestamp_s)
             placement = self._place(frame, features)
+            if placement is None and self.view_change.count_lost():
+                raw, features, placement = self._place_wide(frame, raw)
+            placement = placement or self._register(frame, features)
             if placement is None:
                 self._lose()
                 return None
             placed_by = placement.placed_by
             features, placement = self._correct_by_pose(frame, raw, features, placement)
+            self._measure_step(placement)
         return self._add(frame, raw, features, placement, placed_by)
 
     def find(self, frame: Frame, raw: Features) -> Placed | None:
@@ -178,6 +190,7 @@ class MapTracker:
         self.frames.absorb(other.frames, first_landmark)
         self.motion = other.motion
         self.check.forget_motion()
+        self.view_change.is_large = other.view_change.is_large
         ids = self.motion.landmark_ids
         self.motion.landmark_ids = np.where(ids >= 0, ids + first_landmark, -1)
         self.placed_by += other.placed_by
@@ -224,30 +237,67 @@ class MapTracker:
         self.motion.follow_map()
 
     def _place(self, frame: Frame, features: Features) -> Placement | None:
-        """Every way to place a frame, the cheapest first; None where it is lost."""
-        T_guess = None
+        """Every usual way to place a frame by its features, the cheapest first; None where it is lost."""
         placement = None
         newest = None
         if self.motion.is_known:
-            placement = self._track_motion(frame, features)
+            newest = len(self.map.keyframes) - 1
+            if self.view_change.is_large:
+                placement = self.localiser.from_keyframe(features, newest)
+            placement = placement or self._track_motion(frame, features)
             if placement is None and self.integration.run_all():  # their landmarks may be what is missing
                 self.motion.follow_map()
                 placement = self._track_motion(frame, features)
-            newest = len(self.map.keyframes) - 1
             placement = placement or self.localiser.from_keyframe(features, newest)
-            T_guess = self.motion.predict(frame.timestamp_s)
         else:
             self.relocaliser.schedule.count_frame()
         placement = placement or self.relocaliser.by_place(features, without=newest)
-        placement = placement or self.relocaliser.by_registration(frame, features, T_guess)
-        if placement is not None and not self._is_earned(frame, features, placement):
+        return self._count(frame, features, placement)
+
+    def _place_wide(self, frame: Frame, raw: Features) -> tuple[Features, Features, Placement | None]:
+        """Place a frame that the usual ways did not place by more features and over a wide baseline.
+
+        Returns:
+            Its features, raw and to go on with, and the placement; those given where it is still lost.
+        """
+        was_large = self.view_change.is_large
+        wide = raw if was_large else self._wide_features(frame)
+        self.integration.run_all()
+        self.motion.follow_map()
+        self.view_change.is_large = True
+        found = self.relocaliser.by_recent(wide, is_lost=not self.motion.is_known)
+        placement = self._count(frame, wide, found)
+        if placement is None:
+            self.view_change.is_large = was_large
+            return raw, raw, None
+        self.view_change.found_wide()
+        return wide, wide, placement
+
+    def _register(self, frame: Frame, features: Features) -> Placement | None:
+        """Place a frame by registering its depth; the last and dearest way."""
+        T_guess = self.motion.predict(frame.timestamp_s) if self.motion.is_known else None
+        found = self.relocaliser.by_registration(frame, features, T_guess)
+        return self._count(frame, features, found)
+
+    def _count(self, frame: Frame, features: Features, placement: Placement | None) -> Placement | None:
+        """Count what a found placement saw; None where there is none, or it is not earned."""
+        if placement is None or not self._is_earned(frame, features, placement):
             return None
-        if placement is not None:
-            self.placed_by[placement.placed_by] += 1
-            self.map.count_views(placement.expected_ids, placement.found_ids)
-            if placement.placed_by in (PlacedBy.LAST_KEYFRAME, PlacedBy.PLACE):
-                self.motion.forget()  # found by its view alone: the recording may have been cut
+        self.placed_by[placement.placed_by] += 1
+        self.map.count_views(placement.expected_ids, placement.found_ids)
+        was_cut = placement.placed_by is PlacedBy.LAST_KEYFRAME and not self.view_change.is_large
+        if was_cut or placement.placed_by is PlacedBy.PLACE:
+            self.motion.forget()  # found by its view alone: the recording may have been cut
         return placement
+
+    def _measure_step(self, placement: Placement) -> None:
+        """Learn from a placed frame whether the camera takes large steps."""
+        self.view_change.count_placed()
+        if self.motion.is_known:
+            self.view_change.measure(
+                self.motion.T_camera_world, placement.T_camera_world, placement.landmark_ids
+            )
+        self.shutter.trusts_motion = not self.view_change.is_large
 
     def _is_earned(self, frame: Frame, features: Features, placement: Placement) -> bool:
         """Judge a pose; provisional ones before it that it contradicts are withdrawn."""

@@ -94,9 +94,9 @@ class PoseCheck:
             placement: with :attr:`Placement.expected_ids`, as the localiser found it.
             T_guess: ``(4, 4)`` T_camera_world by the motion model; None where no motion is known.
         """
-        duration_s, self._last_s = timestamp_s - self._last_s, timestamp_s
         if why := self._unearned(features, placement):
             return Judgement(Verdict.LOST, why, self.lose())
+        duration_s, self._last_s = timestamp_s - self._last_s, timestamp_s
         if why := self._suspicion(duration_s, features, placement, T_guess):
             withdrawn = self.lose()
             self._provisional_s = [timestamp_s]

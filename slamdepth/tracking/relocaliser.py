@@ -28,6 +28,7 @@ from slamdepth.typing import Floats, Floats32
 log = logging.getLogger(__name__)
 
 _CANDIDATES = 4
+_RECENT = 3
 _CLOUD_KEYFRAMES = 4
 _CLOUD_COLUMNS = 80  # points across a cloud, whatever the image's size
 # A camera lost for a while has an old guess. Of 1,000 registrations over 0.3 to 3 s of two real sequences,
@@ -77,6 +78,21 @@ class Relocaliser:
             if placement is not None:
                 return replace(placement, placed_by=PlacedBy.PLACE)
         return None
+
+    def by_recent(self, features: Features, *, is_lost: bool) -> Placement | None:
+        """Place a frame by one of the newest keyframes or by those that look like it.
+
+        Args:
+            is_lost: no motion leads from the frame before to this one.
+        """
+        newest = len(self._map.keyframes) - 1
+        for k in range(newest, max(newest - _RECENT, -1), -1):
+            placement = self._localiser.from_keyframe(
+                features, k, minimum=self._config.loops.min_inliers, is_lost=is_lost or k < newest
+            )
+            if placement is not None:
+                return replace(placement, placed_by=PlacedBy.PLACE if is_lost else PlacedBy.LAST_KEYFRAME)
+        return self.by_place(features, without=newest)
 
     def by_registration(self, frame: Frame, features: Features, T_guess: Floats | None) -> Placement | None:
         """Place a frame by registering its depth.

@@ -31,14 +31,16 @@ class RollingShutter:
     Attributes:
         readout_s: seconds from the first row of an image to the last; 0 while nothing is known.
         sigma_s: its deviation where it was estimated, else None.
-        is_estimated: whether it is to be estimated from the motion.
+        trusts_motion: False while frames are so far apart that the step between two says nothing of the
+            velocity during one; nothing is corrected or estimated then.
     """
 
     def __init__(self, camera: Camera, config: ShutterConfig, map_: Map) -> None:
         self._raw_camera = camera
         self._camera = camera.without_distortion()
         self._map = map_
-        self.is_estimated = config.readout_ms is None
+        self.trusts_motion = True
+        self._may_estimate = config.readout_ms is None
         self.readout_s = 0.0 if config.readout_ms is None else 1e-3 * config.readout_ms
         self.sigma_s: float | None = None
         self._next_estimate = _FIRST_ESTIMATE
@@ -46,7 +48,12 @@ class RollingShutter:
     @property
     def is_active(self) -> bool:
         """Whether there is anything to correct."""
-        return self.readout_s != 0.0
+        return self.readout_s != 0.0 and self.trusts_motion
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether it is to be estimated from the motion."""
+        return self._may_estimate and self.trusts_motion
 
     def correct(self, raw: Features, velocity: Floats, inverse_depth: Floats) -> Features:
         """``raw`` features with their ``px`` at the middle row's time.

@@ -25,6 +25,9 @@ from slamdepth.tracking.map_tracker import MapTracker, Placed
 from slamdepth.tracking.workers import DepthWorker, Workers
 from slamdepth.types import Camera, Frame, StepResult, TrackingStatus
 
+_WIDE_FEATURES = 3  # times as many where frames are far apart
+_MOST_FEATURES = 10000
+
 _STATUS = {
     PlacedBy.MOTION: TrackingStatus.TRACKING,
     PlacedBy.LAST_KEYFRAME: TrackingStatus.TRACKING,
@@ -60,6 +63,7 @@ class Tracker:
         self.config = config = config or Config()
         model = metric_model(depth_model, config)
         self._prepare = Preparation(camera, config.features)
+        self._prepare_wide: Preparation | None = None  # made where it is needed first
         self._watch = Stopwatch()
         self._workers = Workers(DepthWorker(model, self._watch, with_uncertainty=config.depth.uncertainty))
         self._atlas = Atlas(self._new_map, config)
@@ -69,7 +73,10 @@ class Tracker:
         _load_libraries()
 
     def _new_map(self, id_: int) -> MapTracker:
-        return MapTracker(id_, self.camera, self.config, self._prepare.levels, self._workers, self._watch)
+        levels = self._prepare.levels
+        return MapTracker(
+            id_, self.camera, self.config, levels, self._workers, self._watch, self._wide_features
+        )
 
     @property
     def _active(self) -> MapTracker:
@@ -114,6 +121,16 @@ class Tracker:
         prepared = prepared or self._prepare(frame)
         self._watch.add("features", prepared.took_ms)
         self._steps += 1
+        return prepared.features
+
+    def _wide_features(self, frame: Frame) -> Features:
+        """More features of a frame, for a search over a wide baseline."""
+        if self._prepare_wide is None:
+            count = min(_WIDE_FEATURES * self.config.features.count, _MOST_FEATURES)
+            wide = self.config.features.model_copy(update={"count": count})
+            self._prepare_wide = Preparation(self.camera, wide)
+        prepared = self._prepare_wide(frame)
+        self._watch.add("features", prepared.took_ms)
         return prepared.features
 
     def _result(self, frame: Frame, placed: Placed | None) -> StepResult:
