@@ -16,20 +16,21 @@ from slamdepth.config import Config
 from slamdepth.geometry import invert, rotation_angle_rad, transform
 from slamdepth.loops.consistency import Drift, RefusedLoops
 from slamdepth.loops.edges import MeasuredLoop, odometry_edges, weakness
+from slamdepth.loops.look_alikes import ALREADY_LINKED, fits_elsewhere
 from slamdepth.loops.meeting import Meeting
 from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map import Map, MapKeyframe
-from slamdepth.mapping.map_view import NEAREST_M
+from slamdepth.mapping.map_view import NEAREST_M, MapView
 from slamdepth.mapping.placement import Placement
 from slamdepth.typing import Floats, Ints
 
 log = logging.getLogger(__name__)
 
-_ALREADY_LINKED = 15  # shared landmarks that make two keyframes neighbours
 _CANDIDATES = 2  # of those that look most alike, and of those that odometry allows
 _MIN_SCORE_SHARE = 0.6  # of the similarity of two neighbours in time
 _MIN_VERIFIED = 15  # matches that verification starts from
 _LOOP_SIGMAS = (0.01, 0.02, 0.03)  # radians, metres, natural logarithm of the scale
+_LIKELY = 0.5  # of the largest drift that is believed: 1.5 deviations instead of three
 _LOOSER = (2.0, 4.0, 8.0)  # factors on the odometry's deviations, once confirmed loops contradict it
 
 
@@ -141,7 +142,7 @@ class LoopCloser:
         if newest < 0:
             return [], []
         shared = self._map.shared_landmarks(keyframe.landmark_ids)
-        exclude = {k for k in range(len(shared)) if k > newest or shared[k] >= _ALREADY_LINKED}
+        exclude = {k for k in range(len(shared)) if k > newest or shared[k] >= ALREADY_LINKED}
         least = _MIN_SCORE_SHARE * self.places.score(keyframe.id, keyframe.id - 1)
         answers = self.places.query_keyframe(keyframe.id, exclude=exclude, top_k=newest + 1)
         alike = [k for k, score in answers if score >= least]
@@ -197,7 +198,10 @@ class LoopCloser:
             if result is None:
                 drift = self._drift()
                 new = self._refused.confirmed(edge, drift)
-                result = self._optimised_after_drift(T_old, together, new)
+                # where places look alike false loops are common: a likely drift must explain this one
+                is_likely = drift.explains(edge, _LIKELY)
+                if new and (is_likely or not self._has_look_alike(keyframe, edge, placement)):
+                    result = self._optimised_after_drift(T_old, together, new)
             if result is None:
                 self._refused.add(edge, drift)
                 self.refused += 1
@@ -210,6 +214,26 @@ class LoopCloser:
         self._map.count_views(placement.expected_ids, placement.found_ids)
         self._map.fuse_view(keyframe, placement.landmark_ids)
         return scales
+
+    def _has_look_alike(self, keyframe: MapKeyframe, edge: Edge, placement: Placement) -> bool:
+        """Whether the place of a loop looks like another one, before the keyframes that see it again."""
+        candidate = self.map.keyframes[edge.i]
+        views = ((keyframe, placement.T_camera_world), (candidate, candidate.T_camera_world))
+        distance_m, fewest = self._distance_m(keyframe), self._config.loops.min_inliers
+        newest = keyframe.id - self._config.loops.min_gap
+        return any(
+            fits_elsewhere(view, self.places.vector(view.id), self, T, distance_m, fewest, newest)
+            for view, T in views
+        )
+
+    @property
+    def map(self) -> MapView:
+        """The map whose loops are closed."""
+        return self._map
+
+    def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
+        """Place a keyframe by matching it with the keyframe ``candidate``."""
+        return self._verifier.from_keyframe(keyframe.features, candidate, minimum=_MIN_VERIFIED)
 
     def _optimised(
         self, T_old: Floats, together: Ints, new: list[Edge], looser: float = 1.0

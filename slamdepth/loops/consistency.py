@@ -72,11 +72,15 @@ class Drift:
         turned = rotation_angle_rad(np.swapaxes(T[:j, :3, :3], 1, 2) @ T[j, :3, :3])
         return np.flatnonzero((apart_m <= reach_m + lost[:, 1]) & (turned <= _ASIDE + lost[:, 0]))
 
-    def explains(self, edge: Edge) -> bool:
-        """Whether the odometry between its keyframes may have drifted as much as a loop says."""
+    def explains(self, edge: Edge, share: float = 1.0) -> bool:
+        """Whether the odometry between its keyframes may have drifted as much as a loop says.
+
+        Args:
+            share: of :meth:`bounds`.
+        """
         i, j = sorted((edge.i, edge.j))
         error = _error(edge, self.T_world_camera)[: self.dimensions]
-        return all(e <= bound for e, bound in zip(error, self.bounds(j)[i], strict=False))
+        return all(e <= share * bound for e, bound in zip(error, self.bounds(j)[i], strict=False))
 
 
 class RefusedLoops:

@@ -12,22 +12,18 @@ place counts only if it is unique: nothing else in either map looks like it by t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from slamdepth.backend.pose_graph import Edge
 from slamdepth.geometry import Similarity, invert, rotation_angle_rad, transform
-from slamdepth.loops.places import PlaceRecogniser
+from slamdepth.loops.look_alikes import Place, fits_elsewhere
 from slamdepth.mapping.map_keyframe import AnchoredPose, MapKeyframe
 from slamdepth.mapping.map_view import NEAREST_M, MapView
 from slamdepth.mapping.placement import Placement
 from slamdepth.typing import Floats, Floats32, Ints
 
 _CANDIDATES = 2
-_LOOK_ALIKES = 8  # keyframes that a place is compared with before it is taken for unique
-_ALREADY_LINKED = 15  # shared landmarks that make two keyframes neighbours
-_ELSEWHERE = (0.3, 0.3)  # radians, and share of the distance of what is seen: more is another place
 _MIN_SCORE_SHARE = 0.6  # of the similarity of two neighbours in time
 _FEWEST_DEPTHS = 10  # features with a landmark in both maps, which give the scale between them
 _AGREEING = 3  # keyframes that must say the same
@@ -37,20 +33,6 @@ _MAX_SHIFT = 0.1  # of the distance of what the keyframe sees
 _MAX_LOG_SCALE = 0.2  # between meetings; a network's scale differs by as much from image to image
 _MAX_LOG_SCALE_MEASURED = 0.05  # of the similarity itself, where a sensor made both maps
 _MAX_LOG_SCALE_PREDICTED = 1.1  # a network errs by a factor of three hardly ever
-
-
-class Place(Protocol):
-    """A map, as far as a keyframe can be looked for in it."""
-
-    @property
-    def map(self) -> MapView: ...
-
-    @property
-    def places(self) -> PlaceRecogniser: ...
-
-    def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
-        """Place a keyframe of any map by matching it with the keyframe ``candidate`` of this map."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -136,34 +118,7 @@ def _is_unique(meeting: Meeting, home: Place, other: Place, words: Floats32, min
         (candidate, other.places.vector(candidate.id), other, candidate.T_camera_world, meeting.distance_m),
         (meeting.keyframe, words, home, meeting.keyframe.T_camera_world, meeting.distance_m / meeting.scale),
     )
-    return not any(_fits_elsewhere(*view, min_inliers) for view in views)
-
-
-def _fits_elsewhere(
-    keyframe: MapKeyframe,
-    words: Floats32,
-    place: Place,
-    T_camera_world: Floats,
-    distance_m: float,
-    min_inliers: int,
-) -> bool:
-    """Whether a keyframe fits a map in another place than at ``T_camera_world (4, 4)``."""
-    shared = place.map.shared_landmarks(keyframe.landmark_ids) if _is_of(keyframe, place.map) else None
-    for k, _ in place.places.query_vector(words, top_k=_LOOK_ALIKES):
-        if shared is not None and (k == keyframe.id or shared[k] >= _ALREADY_LINKED):
-            continue
-        placement = place.place_keyframe(keyframe, k)
-        if placement is None or placement.inliers < min_inliers:
-            continue
-        D = placement.T_camera_world @ invert(T_camera_world)
-        turned, shifted = float(rotation_angle_rad(D[:3, :3])), float(np.linalg.norm(D[:3, 3]))
-        if turned > _ELSEWHERE[0] or shifted > _ELSEWHERE[1] * distance_m:
-            return True
-    return False
-
-
-def _is_of(keyframe: MapKeyframe, map_: MapView) -> bool:
-    return keyframe.id < len(map_.keyframes) and map_.keyframes[keyframe.id] is keyframe
+    return not any(fits_elsewhere(*view, min_inliers) for view in views)
 
 
 def _meeting(
