@@ -127,7 +127,7 @@ def test_a_number_and_a_known_baseline(tiny_room: Path, tmp_path: Path) -> None:
     half = run(tiny_room, tmp_path / "half", "--depth-scale", 0.5)
     assert half["scale"]["source"] == "value"
     ratio = half["ate"]["sim3"]["scale"] / given["ate"]["sim3"]["scale"]
-    assert ratio == pytest.approx(2.0, rel=0.02)
+    assert ratio == pytest.approx(2.0, rel=0.03)
 
     from slamdepth.datasets import open_dataset
 

@@ -17,6 +17,8 @@ MAX_STEP_S = 0.25
 _FASTER = 15.0  # than the median speed
 _LEAST_STEP_RAD = 0.05  # about 3 degrees of image motion: less is jitter, however still the camera stands
 _CONFIRMED = 0.25  # of a step's velocity, found again in the step before or after
+_SURE = 0.1  # quality: below, the matches of a pose hardly determine it
+_GOOD = 0.5
 _SAMPLES = 50  # cameras that the scene's distance is measured from
 _FEWEST_POINTS = 10
 _CONFIRM_S = 1.0  # a hand that is pushed keeps on for less
@@ -51,13 +53,14 @@ def judged_steps(trajectory: Trajectory) -> Bools:
     return judged
 
 
-def find_leaps(trajectory: Trajectory, distance: float | None) -> Ints:
+def find_leaps(trajectory: Trajectory, distance: float | None, quality: Floats | None = None) -> Ints:
     """Indices of the steps that the motion around them contradicts; step ``n`` leads to pose ``n + 1``.
 
     Rotation and translation are compared in one unit, the image motion they cause: an angle, and a length
     over the distance of the scene. A leap is a step of
 
-    * more than 15 times the median speed: the quickest turn of the recordings looked at has 5 times;
+    * more than 15 times the median speed, or of the camera's centre alone: the quickest turn of the
+      recordings looked at has 5 times;
     * more than 3 degrees: before a camera that stands still the median speed is close to 0;
     * which neither the step before nor the step after confirms by a quarter of its velocity in its direction:
       a camera has mass, so a real quick turn takes several frames.
@@ -67,6 +70,8 @@ def find_leaps(trajectory: Trajectory, distance: float | None) -> Ints:
 
     Args:
         distance: of the scene, see :func:`scene_distance`; None compares rotations only.
+        quality: ``(N,)`` of the poses, see :class:`slamdepth.StepResult`: a step to or from a pose that its
+            own matches hardly determine confirms nothing. None: all do.
     """
     judged = judged_steps(trajectory)
     if not judged.any():
@@ -74,23 +79,28 @@ def find_leaps(trajectory: Trajectory, distance: float | None) -> Ints:
     velocity = _image_velocity(trajectory, distance)
     duration_s = np.diff(trajectory.timestamps_s)
     speed = np.linalg.norm(velocity, axis=1)
+    centre_m_s = np.linalg.norm(np.diff(trajectory.T_world_camera[:, :3, 3], axis=0), axis=1) / duration_s
     is_fast = speed > _FASTER * np.median(speed[judged])
+    is_fast |= centre_m_s > _FASTER * np.median(centre_m_s[judged])
     is_far = speed * duration_s > _LEAST_STEP_RAD
     candidates = np.flatnonzero(judged & is_fast & is_far)
-    return candidates[[_is_contradicted(velocity, judged, int(n)) for n in candidates]]
+    confirms = judged if quality is None else judged & (np.minimum(quality[:-1], quality[1:]) >= _SURE)
+    return candidates[[_is_contradicted(velocity, judged, confirms, int(n)) for n in candidates]]
 
 
-def unconfirmed_poses(trajectory: Trajectory, distance: float | None) -> Bools:
+def unconfirmed_poses(trajectory: Trajectory, distance: float | None, quality: Floats | None = None) -> Bools:
     """Poses of short pieces that only leaps join to the rest: no motion confirms them.
 
     Leaps (:func:`find_leaps`) and gaps of over 0.25 s cut a trajectory into pieces. A piece of less than a
     second that begins or ends with a leap is unconfirmed: a single pose that leaps there and back, or the
-    first poses of a map before it found itself. The search is repeated without them, as they hid what the
+    first poses of a map before it found itself. One between a leap and a gap is kept where most of its poses
+    are good by themselves: after a cut. The search is repeated without them, as they hid what the
     motion around them is. The longest piece is always kept, and so is everything of a trajectory without
     leaps.
 
     Args:
         distance: of the scene, see :func:`scene_distance`; None compares rotations only.
+        quality: ``(N,)`` of the poses, see :func:`find_leaps`.
 
     Returns:
         ``(N,)``, True where a pose is unconfirmed.
@@ -98,7 +108,8 @@ def unconfirmed_poses(trajectory: Trajectory, distance: float | None) -> Bools:
     kept = np.arange(len(trajectory))
     while len(kept) > 1:
         rest = Trajectory(trajectory.timestamps_s[kept], trajectory.T_world_camera[kept])
-        short = _short_pieces(rest, find_leaps(rest, distance))
+        sure = None if quality is None else quality[kept]
+        short = _short_pieces(rest, find_leaps(rest, distance, sure), sure)
         if not short.any():
             break
         kept = kept[~short]
@@ -107,13 +118,14 @@ def unconfirmed_poses(trajectory: Trajectory, distance: float | None) -> Bools:
     return unconfirmed
 
 
-def confirmed(trajectory: Trajectory, points_w: Floats) -> Trajectory:
+def confirmed(trajectory: Trajectory, points_w: Floats, quality: Floats | None = None) -> Trajectory:
     """The trajectory without its :func:`unconfirmed_poses`; itself where there are none.
 
     Args:
         points_w: ``(P, 3)`` map points, world frame.
+        quality: ``(N,)`` of the poses, see :func:`find_leaps`.
     """
-    drop = unconfirmed_poses(trajectory, scene_distance(trajectory, points_w))
+    drop = unconfirmed_poses(trajectory, scene_distance(trajectory, points_w), quality)
     if not drop.any():
         return trajectory
     return replace(
@@ -123,10 +135,11 @@ def confirmed(trajectory: Trajectory, points_w: Floats) -> Trajectory:
     )
 
 
-def _short_pieces(trajectory: Trajectory, leaps: Ints) -> Bools:
+def _short_pieces(trajectory: Trajectory, leaps: Ints, quality: Floats | None) -> Bools:
     """``(N,)`` whether a pose is in a piece of less than a second with a leap at an end.
 
-    The longest piece is in none.
+    The longest piece is in none, nor is one between a leap and a gap whose poses are good by themselves, as
+    after a cut.
     """
     is_leap = np.zeros(len(trajectory) + 1, dtype=bool)  # at n: between poses n - 1 and n
     is_leap[leaps + 1] = True
@@ -138,6 +151,9 @@ def _short_pieces(trajectory: Trajectory, leaps: Ints) -> Bools:
     lasts_s = trajectory.timestamps_s[end - 1] - trajectory.timestamps_s[first]
     is_short = (lasts_s < _CONFIRM_S) & (is_leap[first] | is_leap[end])
     is_short[np.argmax(lasts_s)] = False
+    if quality is not None:
+        is_good = [float(np.median(quality[a:b])) >= _GOOD for a, b in zip(first, end, strict=True)]
+        is_short &= (is_leap[first] & is_leap[end]) | ~np.array(is_good)
     return np.repeat(is_short, end - first)
 
 
@@ -151,7 +167,7 @@ def _image_velocity(trajectory: Trajectory, distance: float | None) -> Floats:
     return velocity
 
 
-def _is_contradicted(velocity: Floats, judged: Bools, n: int) -> bool:
+def _is_contradicted(velocity: Floats, judged: Bools, confirms: Bools, n: int) -> bool:
     neighbours = [m for m in (n - 1, n + 1) if 0 <= m < len(judged) and judged[m]]
-    along = [float(velocity[m] @ velocity[n]) for m in neighbours]
+    along = [float(velocity[m] @ velocity[n]) if confirms[m] else 0.0 for m in neighbours]
     return bool(along) and max(along) < _CONFIRMED * float(velocity[n] @ velocity[n])

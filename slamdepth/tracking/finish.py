@@ -102,7 +102,7 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
         keyframes = tuple(replace(made.result(), id=n) for n, made in enumerate(making))
     points_m = map_.landmarks.position_w[map_.seen_by(2)]
     found = frames.trajectory()
-    trajectory = confirmed(found, points_m)
+    trajectory = confirmed(found, points_m, frames.quality)
     kept_s = set(trajectory.timestamps_s.tolist())
     withdrawn = frames.withdrawn + len(found) - len(trajectory)
     statistics = replace(statistics, tracked=len(trajectory), withdrawn=withdrawn)

@@ -48,6 +48,7 @@ class _Placed:
     timestamp_s: float
     is_keyframe: bool
     follows_motion: bool
+    quality: float
     pose: AnchoredPose
     landmark_ids: NDArray[np.int32]
     px: Floats32
@@ -97,12 +98,14 @@ class FrameLog:
         is_keyframe: bool,
         *,
         follows_motion: bool = True,
+        quality: float = 1.0,
     ) -> None:
         """Remember where a frame is, relative to a keyframe that sees the same.
 
         Args:
             raw: features as extracted, not corrected for a rolling shutter.
             follows_motion: a motion leads to it from the frame before.
+            quality: of the pose, see :class:`~slamdepth.types.StepResult`.
         """
         reference = self._map.keyframes[-1]
         seen = placement.landmark_ids
@@ -116,6 +119,7 @@ class FrameLog:
                 timestamp_s,
                 is_keyframe,
                 follows_motion,
+                quality,
                 AnchoredPose.of(placement.T_camera_world, reference),
                 (seen[at] + len(self._ids_now)).astype(np.int32),
                 raw.px[at].astype(np.float32),
@@ -248,6 +252,11 @@ class FrameLog:
         moved = np.linalg.norm(invert(estimate.T_camera_world)[:3, 3] - center_w)
         if moved < _MAX_SHIFT_SHARE * distance:
             placed.pose = AnchoredPose.of(estimate.T_camera_world, placed.pose.keyframe)
+
+    @property
+    def quality(self) -> Floats:
+        """Of each placed frame's pose when it was placed, ``(N,)``."""
+        return np.array([p.quality for p in self._placed])
 
     def trajectory(self) -> Trajectory:
         """All placed frames in the world frame."""

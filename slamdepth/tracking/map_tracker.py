@@ -215,8 +215,16 @@ class MapTracker:
         else:
             self.motion.advance(frame.timestamp_s, placement.T_camera_world)
             self.motion.anchor(placement, self.map.keyframes[-1])
-        self.frames.add(frame.timestamp_s, raw, placement, is_keyframe, follows_motion=follows_motion)
-        return self._placed(frame, features, placement, placed_by, is_keyframe=is_keyframe)
+        placed = self._placed(frame, features, placement, placed_by, is_keyframe=is_keyframe)
+        self.frames.add(
+            frame.timestamp_s,
+            raw,
+            placement,
+            is_keyframe,
+            follows_motion=follows_motion,
+            quality=placed.quality,
+        )
+        return placed
 
     def _placed(
         self,

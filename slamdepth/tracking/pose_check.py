@@ -65,10 +65,14 @@ class PoseCheck:
     * its matches do not determine it, as of points on one line. A large covariance is no reason: a white room
       with a bad depth is tracked well with deviations of over 20 % of the scene's distance.
 
-    It is PROVISIONAL where few landmarks agree and no motion leads there, as after a loss, and where it is
-    farther from the predicted pose than a camera can accelerate: an image motion of 100 rad/s^2 and three
-    deviations of the last pose. A hand does 50, and at 5 frames a second that allows everything. Three frames
-    that follow, or a second of them, confirm it; the next loss or contradiction withdraws it.
+    It is PROVISIONAL where
+
+    * predicted depth alone was registered: on a bare wall that shape is made up;
+    * few landmarks agree and no motion leads there, as after a loss;
+    * it is farther from the predicted pose than a camera can accelerate: an image motion of 100 rad/s^2 and
+      three deviations of the last pose, which at 5 frames a second allows everything.
+
+    Three frames that follow, or a second of them, confirm it; the next loss or contradiction withdraws it.
     """
 
     def __init__(self, camera: Camera, map_: MapView, localiser: Localiser) -> None:
@@ -124,6 +128,8 @@ class PoseCheck:
         self, duration_s: float, features: Features, placement: Placement, T_guess: Floats | None
     ) -> str:
         """Why the pose has to be confirmed; empty where it has not."""
+        if placement.placed_by is PlacedBy.REGISTRATION and not self._map.is_measured:
+            return "placed by the shape of predicted depth alone"
         if T_guess is None:
             return "" if self._has_many(features, placement) else "few matches where no motion leads"
         T = placement.T_camera_world
