@@ -186,7 +186,8 @@ def _cells(on: dict[str, Any], off: dict[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
-def _whole_numbers(text: str) -> list[int]:
+def whole_numbers(text: str) -> list[int]:
+    """Numbers with commas between them."""
     return [int(part) for part in comma_separated(text)]
 
 
@@ -195,7 +196,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = parser_of("loops", __doc__)
     add = parser.add_argument
     add("sequences", nargs="*", type=Path, metavar="SEQ", help="further sequences with ground truth")
-    add("--seeds", type=_whole_numbers, default=list(range(10)), metavar="N,...",
+    add("--seeds", type=whole_numbers, default=list(range(10)), metavar="N,...",
         help="aliased rooms of these seeds (default: 0 to 9)")  # fmt: skip
     add("--frames", type=int, default=600, metavar="N", help="of a room (default: 600)")
     add("--width", type=int, default=320, metavar="PX", help="of a room's images (default: 320)")
@@ -204,7 +205,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--only", type=comma_separated, default=[], metavar="NAMES", help="of --data, with commas")
     add("--depth", type=comma_separated, default=["sensor", "dinov2"], metavar="NAMES",
         help="with commas (default: sensor,dinov2)")  # fmt: skip
-    add("--starts", type=_whole_numbers, default=[0], metavar="N,...", help="first frames (default: 0)")
+    add("--starts", type=whole_numbers, default=[0], metavar="N,...", help="first frames (default: 0)")
     add("--work", type=Path, default=default_cache(), metavar="DIR", help="folder of the rendered rooms")
     add("--inject", type=float, default=0.0, metavar="SHARE",
         help="share of the loop decisions that are about a false place (default: 0)")  # fmt: skip
