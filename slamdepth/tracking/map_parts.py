@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of one map."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from slamdepth.config import Config
+from slamdepth.frontend.features import ScaleLevels
+from slamdepth.mapping.map import Map
+from slamdepth.mapping.placement import PlacedBy
+from slamdepth.stopwatch import Stopwatch
+from slamdepth.tracking.frame_log import FrameLog
+from slamdepth.tracking.integration import KeyframeIntegration
+from slamdepth.tracking.localiser import Localiser
+from slamdepth.tracking.motion import MotionModel
+from slamdepth.tracking.pose_check import PoseCheck
+from slamdepth.tracking.relocaliser import Relocaliser
+from slamdepth.tracking.rolling_shutter import RollingShutter
+from slamdepth.tracking.workers import Workers
+from slamdepth.types import Camera
+
+
+class MapParts:
+    """A map, and all that belongs to it alone.
+
+    Args:
+        id_: number of the map in its run.
+        levels: pyramid levels of the extractor.
+        workers, watch: shared by the maps of a run.
+
+    Attributes:
+        id: number of the map, from 0 in the order of their start.
+        map, frames, motion, shutter, localiser, check, view_change, integration, relocaliser: the parts.
+        placed_by: how many frames were placed by what.
+    """
+
+    def __init__(
+        self,
+        id_: int,
+        camera: Camera,
+        config: Config,
+        levels: ScaleLevels,
+        workers: Workers,
+        watch: Stopwatch,
+    ) -> None:
+        self.id = id_
+        self._config = config
+        self._workers = workers
+        self._watch = watch
+        self.map = Map(config.map.keyframe_memory_mib)
+        self.frames = FrameLog(camera, self.map)
+        self.motion = MotionModel()
+        self.shutter = RollingShutter(camera, config.shutter, self.map)
+        self.localiser = Localiser(camera, config, self.map, levels)
+        self.check = PoseCheck(camera, self.map, self.localiser)
+        self.view_change = self.localiser.view_change
+        self.integration = KeyframeIntegration(
+            camera,
+            config,
+            self.map,
+            self.localiser,
+            self.frames,
+            self.shutter,
+            workers,
+            watch,
+        )
+        self.relocaliser = Relocaliser(
+            camera,
+            config,
+            self.map,
+            self.localiser,
+            self.integration.loops.places,
+            workers.depth,
+        )
+        self.placed_by: Counter[PlacedBy] = Counter()
