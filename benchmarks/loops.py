@@ -32,14 +32,13 @@ from benchmarks.loops_truth import judge_loops, true_keyframes
 from benchmarks.markdown import markdown_table
 from benchmarks.record import environment
 from benchmarks.resume import RowFile
+from benchmarks.seeded import seeded_depth_model
 from benchmarks.wild_recordings import Recording, find_recordings, sequence_of
 from benchmarks.wild_scores import score_piece
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
-from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import InputError, SlamdepthError
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.pipeline.run import seed_everything, seed_torch
 from slamdepth.synth.sequence import SynthSettings, render_sequence
 from slamdepth.tracking import Tracker
 from slamdepth.typing import Floats32
@@ -82,9 +81,7 @@ def run(
     dataset = open_dataset(recording.sequence, recording.camera_file)
     config = Config.from_dict({"depth": {"name": depth}, "loops": {"enabled": with_loops}})
     begun = time.perf_counter()
-    seed_everything(config.seed)
-    model = create_depth_model(depth, device=config.device, seed=config.seed)
-    seed_torch(config.seed)
+    model = seeded_depth_model(depth, config)
     frames = range(start, len(dataset))
     try:
         with Tracker(dataset.camera, model, config) as tracker:

@@ -30,12 +30,11 @@ from benchmarks.loops import aliased_rooms, whole_numbers
 from benchmarks.markdown import markdown_table
 from benchmarks.record import environment
 from benchmarks.resume import RowFile
+from benchmarks.seeded import seeded_depth_model
 from benchmarks.wild_scores import score_piece
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
-from slamdepth.depth.registry import create_depth_model
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.pipeline.run import seed_everything, seed_torch
 from slamdepth.synth.sequence import SynthSettings, render_sequence
 from slamdepth.tracking import Tracker
 from slamdepth.types import Frame, Trajectory
@@ -99,9 +98,7 @@ def there_and_back(name: str, dataset: Dataset, until: int, begin: int, end: int
 def run(splice: Splice, depth: str) -> dict[str, Any]:
     """Track one recording: its figures."""
     config = Config.from_dict({"depth": {"name": depth}})
-    seed_everything(config.seed)
-    model = create_depth_model(depth, device=config.device, seed=config.seed)
-    seed_torch(config.seed)
+    model = seeded_depth_model(depth, config)
     given: dict[float, tuple[Dataset | None, float]] = {}
     with Tracker(splice.first.camera, model, config) as tracker:
         for frame, dataset, time_s in splice.frames(with_depth=depth == "sensor"):

@@ -26,13 +26,12 @@ from rich.console import Console
 from benchmarks.command import errors_in_one_line, parser_of
 from benchmarks.markdown import markdown_table
 from benchmarks.record import environment, write_benchmark
+from benchmarks.seeded import seeded_depth_model
 from benchmarks.worker import memory_mib
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
-from slamdepth.depth.registry import create_depth_model
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.matching import PixelGrid
-from slamdepth.pipeline.run import seed_everything, seed_torch
 from slamdepth.tracking import Tracker
 
 _MIB = 2**20
@@ -194,9 +193,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     changed: dict[str, Any] = {} if asked.budget is None else {"keyframe_memory_mib": asked.budget}
     config = Config.from_dict({"map": changed}, origin="--budget")
     dataset = open_dataset(asked.data / asked.sequence)
-    seed_everything(config.seed)
-    model = create_depth_model(asked.depth, seed=config.seed)
-    seed_torch(config.seed)
+    model = seeded_depth_model(asked.depth, config)
     samples, figures = measure(
         dataset, Tracker(dataset.camera, model, config), asked,
         lambda s: console.print(f"{s.frames} frames: {s.process_mib:.0f} MiB", style="dim"),

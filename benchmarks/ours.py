@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
+from benchmarks.seeded import seeded_depth_model
 from benchmarks.system import Estimate
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
-from slamdepth.depth.registry import create_depth_model
 from slamdepth.pipeline.results import keyframe_trajectory
 from slamdepth.pipeline.run import seed_everything, seed_torch
 from slamdepth.tracking import create_tracker
@@ -24,11 +24,11 @@ class SlamDepth:
     """
 
     def __init__(self, camera: Camera, config: Config, model: DepthModel | None = None) -> None:
-        seed_everything(config.seed)
-        model = model or create_depth_model(
-            config.depth.name, device=config.device, seed=config.seed, weights=config.depth.weights
-        )
-        seed_torch(config.seed)
+        if model is None:
+            model = seeded_depth_model(config.depth.name, config)
+        else:
+            seed_everything(config.seed)
+            seed_torch(config.seed)
         self._tracker = create_tracker(camera, model, config)
 
     def step(self, frame: Frame) -> None:

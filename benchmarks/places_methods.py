@@ -114,7 +114,7 @@ def verified(places: Sequence[Place], camera: Camera, config: Config, min_gap: i
         keyframe = map_.keyframes[query]
         allowed = set(earlier)
         found = []
-        for k in closer.candidates(keyframe)[0]:
+        for k in closer.candidates(keyframe, closer.drift())[0]:
             placed = closer.verify(keyframe, k) if k in allowed else None
             if placed is not None:
                 found.append((k, float(placed[0].inliers)))

@@ -28,13 +28,12 @@ from benchmarks.markdown import markdown_table
 from benchmarks.poses_scores import EXACT, MOTION_CAPTURE, Poses, TruthError, figures
 from benchmarks.record import environment
 from benchmarks.resume import RowFile
+from benchmarks.seeded import seeded_depth_model
 from benchmarks.wild_recordings import Recording, find_recordings
 from slamdepth.config import Config
 from slamdepth.datasets import open_dataset
-from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import InputError, SlamdepthError
 from slamdepth.evaluation.leaps import scene_distance
-from slamdepth.pipeline.run import seed_everything, seed_torch
 from slamdepth.tracking import Tracker
 
 _KEYS = ("sequence", "depth", "start", "stride")
@@ -47,9 +46,7 @@ def run(recording: Recording, depth: str, start: int, stride: int, truth_error: 
     """Track one sequence and judge its poses: the figures, or the error."""
     dataset = open_dataset(recording.sequence, recording.camera_file)
     config = Config.from_dict({"depth": {"name": depth}})
-    seed_everything(config.seed)
-    model = create_depth_model(depth, device=config.device, seed=config.seed)
-    seed_torch(config.seed)
+    model = seeded_depth_model(depth, config)
     steps = []
     try:
         with Tracker(dataset.camera, model, config) as tracker:

@@ -177,9 +177,9 @@ def offered(world: World) -> list[tuple[bool, bool]]:
     found: list[tuple[bool, bool]] = []
     apply = world.closer._apply
 
-    def spy(keyframe: MapKeyframe, edge: Edge, placement: Placement) -> Floats | None:
+    def spy(keyframe: MapKeyframe, edge: Edge, placement: Placement, drift: Drift) -> Floats | None:
         wrong = invert(edge.T_i_j) @ invert(true_pose(edge.i)) @ true_pose(keyframe.id)
-        scales = apply(keyframe, edge, placement)
+        scales = apply(keyframe, edge, placement, drift)
         is_true = rotation_angle_rad(wrong[:3, :3]) < 0.1 and np.linalg.norm(wrong[:3, 3]) < 0.2
         found.append((bool(is_true), scales is not None))
         return scales
@@ -323,7 +323,7 @@ def test_no_loop_between_two_places_that_only_look_alike() -> None:
     world.map.set_depth(impostor, keyframe.prediction.load(), unknown, unknown)
     poses = world.map.T_world_camera
     assert world.closer.close(impostor, world.closer.describe(fake)) is None
-    assert world.closer.candidates(impostor)[0][:1] == [0]
+    assert world.closer.candidates(impostor, world.closer.drift())[0][:1] == [0]
     np.testing.assert_array_equal(world.map.T_world_camera, poses)
 
 

@@ -10,7 +10,7 @@ essentially epipolar geometry with a weak depth for a new one.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -316,6 +316,21 @@ def corner_deviation_px(
     return float(np.sqrt(largest)) if largest > 0.0 else np.inf
 
 
+def usac_params(seed: int, threshold_px: float, *, confidence: float, iterations: int) -> Any:
+    """OpenCV's USAC with uniform samples, local optimisation and MSAC score."""
+    import cv2
+
+    params = cv2.UsacParams()
+    params.randomGeneratorState = seed
+    params.confidence = confidence
+    params.maxIterations = iterations
+    params.threshold = threshold_px
+    params.sampler = cv2.SAMPLING_UNIFORM
+    params.score = cv2.SCORE_METHOD_MSAC
+    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    return params
+
+
 def pose_from_scratch(
     camera: Camera, points_w: Floats, px: Floats, *, seed: int, threshold_px: float = 6.0, minimum: int = 12
 ) -> tuple[Floats, NDArray[np.bool_]] | None:
@@ -328,14 +343,7 @@ def pose_from_scratch(
 
     if len(points_w) < minimum:
         return None
-    params = cv2.UsacParams()
-    params.randomGeneratorState = seed
-    params.confidence = 0.999
-    params.maxIterations = 1000
-    params.threshold = threshold_px
-    params.sampler = cv2.SAMPLING_UNIFORM
-    params.score = cv2.SCORE_METHOD_MSAC
-    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    params = usac_params(seed, threshold_px, confidence=0.999, iterations=1000)
     ok, _, rvec, tvec, index = cv2.solvePnPRansac(
         np.ascontiguousarray(points_w)[:, None],
         np.ascontiguousarray(px)[:, None],

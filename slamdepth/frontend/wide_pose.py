@@ -14,7 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamdepth.frontend.pose import PoseEstimate, pixel_covariance, pose_from_scratch, refine_pose
+from slamdepth.frontend.pose import (
+    PoseEstimate,
+    pixel_covariance,
+    pose_from_scratch,
+    refine_pose,
+    usac_params,
+)
 from slamdepth.geometry import CHI2_2DOF_95, invert, project, transform
 from slamdepth.types import Camera
 from slamdepth.typing import Bools, Floats
@@ -156,14 +162,7 @@ def _from_essential(
     if len(seen.px) < 8:
         return None
     a, b = np.ascontiguousarray(reference_px), np.ascontiguousarray(seen.px)
-    params = cv2.UsacParams()
-    params.randomGeneratorState = seed
-    params.confidence = 0.9999
-    params.maxIterations = 2000
-    params.threshold = _EPIPOLAR_PX
-    params.sampler = cv2.SAMPLING_UNIFORM
-    params.score = cv2.SCORE_METHOD_MSAC
-    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    params = usac_params(seed, _EPIPOLAR_PX, confidence=0.9999, iterations=2000)
     E, mask = cv2.findEssentialMat(a, b, camera.K, camera.K, None, None, params)
     if E is None or E.shape != (3, 3) or mask is None:
         return None

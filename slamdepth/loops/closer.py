@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from slamdepth.backend.pose_graph import Edge, PoseGraphResult, optimise_pose_graph
 from slamdepth.config import Config
-from slamdepth.geometry import invert, rotation_angle_rad, transform
+from slamdepth.geometry import invert, rotation_angle_rad
 from slamdepth.loops.consistency import Drift, RefusedLoops
 from slamdepth.loops.edges import MeasuredLoop, odometry_edges, weakness
-from slamdepth.loops.look_alikes import ALREADY_LINKED, fits_elsewhere
+from slamdepth.loops.look_alikes import ALREADY_LINKED, FEWEST_DEPTHS, depths_in_both, fits_elsewhere
 from slamdepth.loops.meeting import Meeting
 from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map import Map, MapKeyframe
-from slamdepth.mapping.map_view import NEAREST_M, MapView
+from slamdepth.mapping.map_view import MapView
 from slamdepth.mapping.placement import Placement
 from slamdepth.typing import Floats, Ints
 
@@ -88,16 +88,17 @@ class LoopCloser:
         self.places.add_vector(keyframe.id, words)
         if not self._config.loops.enabled:
             return None
-        alike, allowed = self.candidates(keyframe)
+        drift = self.drift()
+        alike, allowed = self.candidates(keyframe, drift)
         for candidate in dict.fromkeys([*alike, *allowed]):
             verified = self.verify(keyframe, candidate)
             if verified is None:
                 continue
             placement, scale = verified
             edge = self._edge(keyframe, candidate, placement, scale)
-            if candidate not in alike and not self._drift().explains(edge):
+            if candidate not in alike and not drift.explains(edge):
                 continue  # a place that looks alike, where the true one was looked for
-            scales = self._apply(keyframe, edge, placement)
+            scales = self._apply(keyframe, edge, placement, drift)
             if scales is not None:
                 if self._is_new(keyframe.id, candidate):
                     self.count += 1
@@ -130,7 +131,7 @@ class LoopCloser:
         gap = self._config.loops.min_gap
         return keyframe - self._last[0] > gap or abs(candidate - self._last[1]) > gap
 
-    def candidates(self, keyframe: MapKeyframe) -> tuple[list[int], list[int]]:
+    def candidates(self, keyframe: MapKeyframe, drift: Drift) -> tuple[list[int], list[int]]:
         """Earlier keyframes that look like ``keyframe`` and share no landmarks with it, best first.
 
         Where places look alike, the true one is seldom among the best by appearance.
@@ -146,7 +147,7 @@ class LoopCloser:
         least = _MIN_SCORE_SHARE * self.places.score(keyframe.id, keyframe.id - 1)
         answers = self.places.query_keyframe(keyframe.id, exclude=exclude, top_k=newest + 1)
         alike = [k for k, score in answers if score >= least]
-        nearby = set(self._drift().nearby(keyframe.id, self._distance_m(keyframe)).tolist())
+        nearby = set(drift.nearby(keyframe.id, self._distance_m(keyframe)).tolist())
         return alike[:_CANDIDATES], [k for k in alike if k in nearby][:_CANDIDATES]
 
     def _distance_m(self, keyframe: MapKeyframe) -> float:
@@ -169,25 +170,25 @@ class LoopCloser:
         both = np.flatnonzero((placement.landmark_ids >= 0) & (keyframe.landmark_ids >= 0))
         both = both[placement.landmark_ids[both] != keyframe.landmark_ids[both]]
         scale = 1.0
-        if not self._map.is_measured and len(both) >= 10:
-            position_w = self._map.landmarks.position_w
-            there = transform(placement.T_camera_world, position_w[placement.landmark_ids[both]])[:, 2]
-            here = transform(keyframe.T_camera_world, position_w[keyframe.landmark_ids[both]])[:, 2]
-            ok = (there > NEAREST_M) & (here > NEAREST_M)
-            if np.count_nonzero(ok) >= 10:
-                scale = float(np.exp(np.median(np.log(there[ok] / here[ok]))))
+        if not self._map.is_measured:
+            there, here = depths_in_both(
+                (self._map, placement.T_camera_world, placement.landmark_ids[both]),
+                (self._map, keyframe.T_camera_world, keyframe.landmark_ids[both]),
+            )
+            if len(there) >= FEWEST_DEPTHS:
+                scale = float(np.exp(np.median(np.log(there / here))))
         return placement, scale
 
     def _edge(self, keyframe: MapKeyframe, candidate: int, placement: Placement, scale: float) -> Edge:
         T_loop = self._map.keyframes[candidate].T_camera_world @ invert(placement.T_camera_world)
         return Edge(candidate, keyframe.id, T_loop, scale, _LOOP_SIGMAS, is_loop=True)
 
-    def _drift(self) -> Drift:
+    def drift(self) -> Drift:
         """How far odometry may have drifted up to now."""
         shared = self._map.shared_with_next()
         return Drift(self._map.T_world_camera, weakness(shared), self._map.is_measured)
 
-    def _apply(self, keyframe: MapKeyframe, edge: Edge, placement: Placement) -> Floats | None:
+    def _apply(self, keyframe: MapKeyframe, edge: Edge, placement: Placement, drift: Drift) -> Floats | None:
         """Correct the map by a verified loop; returns the scales ``(K,)``, None where the loop is refused."""
         new = [edge]
         scales = np.ones(len(self._map.keyframes))
@@ -196,7 +197,6 @@ class LoopCloser:
             T_old, together = self._map.T_world_camera, self._map.covisibility()
             result = self._optimised(T_old, together, new)
             if result is None:
-                drift = self._drift()
                 new = self._refused.confirmed(edge, drift)
                 # where places look alike false loops are common: a likely drift must explain this one
                 is_likely = drift.explains(edge, _LIKELY)

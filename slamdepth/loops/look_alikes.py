@@ -11,15 +11,18 @@ from typing import Protocol
 
 import numpy as np
 
-from slamdepth.geometry import invert, rotation_angle_rad
+from slamdepth.geometry import invert, rotation_angle_rad, transform
 from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map_keyframe import MapKeyframe
-from slamdepth.mapping.map_view import MapView
+from slamdepth.mapping.map_view import NEAREST_M, MapView
 from slamdepth.mapping.placement import Placement
-from slamdepth.typing import Floats, Floats32
+from slamdepth.typing import Floats, Floats32, Ints
 
 ALREADY_LINKED = 15
 """Shared landmarks that make two keyframes neighbours."""
+
+FEWEST_DEPTHS = 10
+"""Features with a landmark on both sides, from which on the ratio of their metres is known."""
 
 _TRIED = 8  # keyframes that look most alike
 _ELSEWHERE = (0.3, 0.3)  # radians, and share of the distance of what is seen: more is another place
@@ -37,6 +40,25 @@ class Place(Protocol):
     def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
         """Place a keyframe of any map by matching it with the keyframe ``candidate`` of this map."""
         ...
+
+
+def depths_in_both(
+    first: tuple[MapView, Floats, Ints], second: tuple[MapView, Floats, Ints]
+) -> tuple[Floats, Floats]:
+    """Depths of what a camera sees twice, as landmarks of one place and of another, metres of each.
+
+    Args:
+        first, second: map, ``T_camera_world (4, 4)`` in it, and landmarks ``(N,)`` of the same features.
+
+    Returns:
+        ``(M,)`` each, of the features whose landmarks are in front of the camera in both.
+    """
+    a, b = (
+        transform(T_camera_world, map_.landmarks.position_w[ids])[:, 2]
+        for map_, T_camera_world, ids in (first, second)
+    )
+    ok = (a > NEAREST_M) & (b > NEAREST_M)
+    return a[ok], b[ok]
 
 
 def fits_elsewhere(

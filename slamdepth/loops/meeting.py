@@ -16,16 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamdepth.backend.pose_graph import Edge
-from slamdepth.geometry import Similarity, invert, rotation_angle_rad, transform
-from slamdepth.loops.look_alikes import Place, fits_elsewhere
+from slamdepth.geometry import Similarity, invert, rotation_angle_rad
+from slamdepth.loops.look_alikes import FEWEST_DEPTHS, Place, depths_in_both, fits_elsewhere
 from slamdepth.mapping.map_keyframe import AnchoredPose, MapKeyframe
-from slamdepth.mapping.map_view import NEAREST_M, MapView
+from slamdepth.mapping.map_view import MapView
 from slamdepth.mapping.placement import Placement
-from slamdepth.typing import Floats, Floats32, Ints
+from slamdepth.typing import Floats32, Ints
 
 _CANDIDATES = 2
 _MIN_SCORE_SHARE = 0.6  # of the similarity of two neighbours in time
-_FEWEST_DEPTHS = 10  # features with a landmark in both maps, which give the scale between them
 _AGREEING = 3  # keyframes that must say the same
 _REMEMBERED = 12  # keyframes a meeting is kept for
 _MAX_TURN_RAD = 0.1
@@ -126,24 +125,20 @@ def _meeting(
 ) -> Meeting | None:
     """The meeting with its scale; None where too little tells the scale, or no such scale can be."""
     at = np.flatnonzero((placement.landmark_ids >= 0) & (keyframe.landmark_ids >= 0))
-    z_there = _depths(there, placement.T_camera_world, placement.landmark_ids[at])
-    z_home = _depths(home, keyframe.T_camera_world, keyframe.landmark_ids[at])
-    ok = (z_there > NEAREST_M) & (z_home > NEAREST_M)
-    if np.count_nonzero(ok) < _FEWEST_DEPTHS:
+    z_there, z_home = depths_in_both(
+        (there, placement.T_camera_world, placement.landmark_ids[at]),
+        (home, keyframe.T_camera_world, keyframe.landmark_ids[at]),
+    )
+    if len(z_there) < FEWEST_DEPTHS:
         return None
-    log_scale = float(np.median(np.log(z_there[ok] / z_home[ok])))
+    log_scale = float(np.median(np.log(z_there / z_home)))
     is_measured = there.is_measured and home.is_measured
     if abs(log_scale) > (_MAX_LOG_SCALE_MEASURED if is_measured else _MAX_LOG_SCALE_PREDICTED):
         return None
     scale = 1.0 if is_measured else float(np.exp(log_scale))
     pose = AnchoredPose.of(placement.T_camera_world, there.keyframes[candidate])
-    distance_m = float(np.median(z_there[ok]))
+    distance_m = float(np.median(z_there))
     return Meeting(keyframe, keyframe.unit, pose, placement.landmark_ids, scale, distance_m)
-
-
-def _depths(map_: MapView, T_camera_world: Floats, ids: Ints) -> Floats:
-    depths: Floats = transform(T_camera_world, map_.landmarks.position_w[ids])[:, 2]
-    return depths
 
 
 class Meetings:

@@ -17,6 +17,7 @@ from slamdepth.stopwatch import Stopwatch
 from slamdepth.tracking.map_parts import MapParts
 from slamdepth.tracking.pose_check import Verdict
 from slamdepth.types import Frame
+from slamdepth.typing import Floats
 
 log = logging.getLogger(__name__)
 
@@ -119,8 +120,7 @@ class FramePlacer:
 
     def _register(self, frame: Frame, features: Features) -> Placement | None:
         """Place a frame by registering its depth; the last and dearest way."""
-        T_guess = self._parts.motion.predict(frame.timestamp_s) if self._parts.motion.is_known else None
-        found = self._parts.relocaliser.by_registration(frame, features, T_guess)
+        found = self._parts.relocaliser.by_registration(frame, features, self._guess(frame))
         return self._count(frame, features, found)
 
     def _count(self, frame: Frame, features: Features, placement: Placement | None) -> Placement | None:
@@ -145,12 +145,16 @@ class FramePlacer:
 
     def _is_earned(self, frame: Frame, features: Features, placement: Placement) -> bool:
         """Judge a pose; provisional ones before it that it contradicts are withdrawn."""
-        T_guess = self._parts.motion.predict(frame.timestamp_s) if self._parts.motion.is_known else None
-        judgement = self._parts.check.judge(frame.timestamp_s, features, placement, T_guess)
+        judgement = self._parts.check.judge(frame.timestamp_s, features, placement, self._guess(frame))
         self._parts.frames.withdraw(judgement.withdrawn_s)
         if judgement.why:
             log.debug("frame %d: pose is %s: %s", frame.index, judgement.verdict.value, judgement.why)
         return judgement.verdict is not Verdict.LOST
+
+    def _guess(self, frame: Frame) -> Floats | None:
+        """``T_camera_world (4, 4)`` by the motion model; None where no motion is known."""
+        motion = self._parts.motion
+        return motion.predict(frame.timestamp_s) if motion.is_known else None
 
     def _track_motion(self, frame: Frame, features: Features) -> Placement | None:
         recent = self._parts.map.resolve(self._parts.motion.landmark_ids)

@@ -27,7 +27,8 @@ from slamdepth.typing import Floats, Ints
 
 _FEWEST_SURE = 40
 _LEAST_SURE_SHARE = 0.07
-_POSE_PX = 4.0  # that a pose errs by at most where the local map is searched
+POSE_PX, FARTHEST_PX = 4.0, 30.0
+"""What a pose errs by at most where the local map is searched, and how far any search there goes."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +179,7 @@ class Localiser:
         """
         ids = self.local_ids(start.landmark_ids)
         visible = self.expected(start.T_camera_world, ids)
-        found, at, _ = self.search(visible, features, _POSE_PX, 30.0)
+        found, at, _ = self.search(visible, features, POSE_PX, FARTHEST_PX)
         if len(found) < self._config.tracking.min_inliers:
             return None
         placement = self._solve(features, start.T_camera_world, found, at, is_judged=True)
@@ -257,7 +258,7 @@ class Localiser:
     def _is_loose(self, placement: Placement, estimate: PoseEstimate) -> bool:
         found_w = self._map.landmarks.position_w[placement.found_ids]
         errs_px = corner_deviation_px(self._camera, placement.T_camera_world, found_w, estimate.information)
-        return bool(errs_px * np.sqrt(CHI2_2DOF_99) > _POSE_PX)
+        return bool(errs_px * np.sqrt(CHI2_2DOF_99) > POSE_PX)
 
     def _sighting(self, features: Features, ids: Ints, at: Ints) -> Sighting:
         landmarks = self._map.landmarks

@@ -14,7 +14,7 @@ from slamdepth.frontend.pose import pose_covariance
 from slamdepth.geometry import CHI2_2DOF_95
 from slamdepth.mapping.map_view import NEAREST_M, MapView
 from slamdepth.mapping.placement import PlacedBy, Placement
-from slamdepth.tracking.localiser import Localiser
+from slamdepth.tracking.localiser import FARTHEST_PX, POSE_PX, Localiser
 from slamdepth.tracking.pose_uncertainty import PoseUncertainty, motion_between
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
@@ -23,7 +23,6 @@ _FEW, _FEW_CELLS = 60, 6  # with more landmarks in more cells, chance and bad ge
 _CELLS = 8  # along each side of the image
 _CHANCE_LOG = math.log(1e-9)
 _EVERY = 4  # landmarks that the scene's distance is taken from
-_SEARCH_PX, _FARTHEST_PX = 4.0, 30.0  # as the localiser's last search
 _FASTEST_RAD_S2 = 100.0
 _SIGMAS = 3.0
 _CONFIRMED_BY, _CONFIRM_S = 3, 1.0
@@ -183,7 +182,7 @@ class PoseCheck:
         visible = self._localiser.expected(placement.T_camera_world, placement.expected_ids)
         size = np.array([self._camera.width - 1, self._camera.height - 1])
         elsewhere = replace(visible, px=size - visible.px)
-        found, at, _ = self._localiser.search(elsewhere, features, _SEARCH_PX, _FARTHEST_PX)
+        found, at, _ = self._localiser.search(elsewhere, features, POSE_PX, FARTHEST_PX)
         order = np.argsort(visible.ids)
         of = order[np.searchsorted(visible.ids, found, sorter=order)]
         S = visible.covariance_px[of] + (features.sigma_px[at] ** 2)[:, None, None] * np.eye(2)
