@@ -196,11 +196,15 @@ class DepthPrediction:
         kind: what ``values`` means. Only ``slamdepth.depth.alignment`` turns a
             prediction into metres of the map.
         sigma_log: ``(H, W)`` float32 standard deviation of the natural logarithm of the
-            depth (about the relative error), or None where the model does not say.
+            depth (about the relative error), or None where the model does not say. Without the error that
+            the whole image has in common.
         is_sensor: True where the values were measured rather than predicted, so that
             their errors are independent from pixel to pixel and their scale is exact.
         gravity: direction of gravity as for :class:`Frame` that the model went by, or None.
         gravity_share: how sure the model is of it, 0 to 1; 1 where the frame brought it.
+        scale_sigma_log: standard deviation of the natural logarithm of the scale error that the whole image
+            has in common; infinite where the image is like nothing the model knows, None where the model
+            does not say.
     """
 
     values: NDArray[np.float32]
@@ -209,6 +213,7 @@ class DepthPrediction:
     is_sensor: bool = False
     gravity: NDArray[np.float64] | None = None
     gravity_share: float = 0.0
+    scale_sigma_log: float | None = None
 
 
 @dataclass(frozen=True)
