@@ -62,7 +62,7 @@ class Camera:
 
     @classmethod
     def from_file(cls, path: str | Path, notes: list[str] | None = None) -> Camera:
-        """Read a ``camera.yaml``, or a calibration as OpenCV or ROS write it.
+        """Read a ``camera.yaml``, or a calibration as OpenCV, ROS, Kalibr, EuRoC or ORB-SLAM write it.
 
         Args:
             notes: takes a line for whatever is unusual in the file, or that it was read from another

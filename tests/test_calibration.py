@@ -72,10 +72,11 @@ def refused(camera: Camera) -> str | None:
 @st.composite
 def real_cameras(draw: st.DrawFn) -> Camera:
     width, height = draw(st.integers(1, 10000)), draw(st.integers(1, 10000))
-    focal = st.floats(0.8, 3.0).map(lambda share: share * max(width, height))
+    fx = draw(st.floats(0.8, 2.3)) * max(width, height)
+    fy = fx * draw(st.floats(1.0, 1.3))
     middle, weak = st.floats(0.45, 0.55), st.floats(0.0, 0.1)
     return Camera(
-        width, height, draw(focal), draw(focal), draw(middle) * width - 0.5, draw(middle) * height - 0.5,
+        width, height, fx, fy, draw(middle) * width - 0.5, draw(middle) * height - 0.5,
         (draw(weak), draw(weak), draw(weak) / 100, -draw(weak) / 100, draw(weak)),
         draw(positive), draw(positive),
     )  # fmt: skip

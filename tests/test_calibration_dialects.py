@@ -87,7 +87,7 @@ def test_what_was_read_is_noted(tmp_path: Path, tiny_room: Path, caplog: pytest.
         "image_width: 320\nimage_height: 240\ncamera_matrix: [[300, 0, 159.5], [0, 300, 119.5], [0, 0, 1]]\n"
     )
     said = (
-        "own.yaml: a calibration of OpenCV or ROS, read as 320x240, fx 300 fy 300 cx 159.5 cy 119.5, "
+        "own.yaml: another tool's calibration, read as 320x240, fx 300 fy 300 cx 159.5 cy 119.5, "
         "distortion [0, 0, 0, 0, 0], 30 Hz"
     )
     assert open_dataset(tiny_room, path).notes[0] == said

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera files: ``camera.yaml``, and the calibrations that OpenCV and ROS write.
+"""Camera files: ``camera.yaml``, and the calibrations that other tools write.
 
 Nothing here knows :class:`slamdepth.types.Camera`, which reads itself by :func:`read_camera`.
 """

@@ -14,7 +14,8 @@
     fps: 30.0                               # may be absent
 
 Numbers may be quoted or have an exponent without a dot, and a ``---`` or ``...`` may end the file. Files of
-OpenCV's and ROS's calibration are read too (:mod:`slamdepth.calibration.dialects`).
+OpenCV's, ROS's (:mod:`slamdepth.calibration.dialects`), Kalibr's, EuRoC's and ORB-SLAM's
+(:mod:`slamdepth.calibration.slam_dialects`) are read too.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from slamdepth.calibration.dialects import (
     translated,
 )
 from slamdepth.calibration.plausible import Pinhole, check_plausible
+from slamdepth.calibration.slam_dialects import as_opencv
 from slamdepth.errors import CameraError
 
 _log = logging.getLogger(__name__)
@@ -46,7 +48,7 @@ OPTIONAL_KEYS = ("distortion", "depth_factor", "fps")
 
 
 def read_camera(path: str | Path, make: Callable[..., _Camera], notes: list[str] | None = None) -> _Camera:
-    """Read a ``camera.yaml``, or a calibration as OpenCV or ROS write it.
+    """Read a ``camera.yaml``, or a calibration as OpenCV, ROS, Kalibr, EuRoC or ORB-SLAM write it.
 
     Args:
         make: the class of the camera, which takes the keys of the file by name.
@@ -58,7 +60,7 @@ def read_camera(path: str | Path, make: Callable[..., _Camera], notes: list[str]
             type, or no camera has such intrinsics; names the file, the key and the allowed ones.
     """
     path = Path(path)
-    values = _load(path)
+    values = as_opencv(path, _load(path))
     foreign = is_calibration(values)
     camera = _made(path, translated(path, values) if foreign else values, make)
     try:
@@ -66,7 +68,7 @@ def read_camera(path: str | Path, make: Callable[..., _Camera], notes: list[str]
     except CameraError as error:
         raise CameraError(f"{path}: {error}") from error
     if foreign:
-        unusual.insert(0, f"{path.name}: a calibration of OpenCV or ROS, read as {_described(camera)}")
+        unusual.insert(0, f"{path.name}: another tool's calibration, read as {_described(camera)}")
     if notes is None:
         for note in unusual:
             _log.warning("%s", note)

@@ -35,6 +35,9 @@ _FARTHEST_CENTRE = (0.15, 0.85)
 """Shares beyond which one that is off in one direction is refused, also for a cropped image."""
 _ALIKE = 0.05
 
+_USUAL_ASPECT = 1.4
+"""Largest ratio of the focal lengths of real images: those of 16:9 squeezed to 4:3 have 1.33."""
+
 _UNDONE_SHARE = 0.05
 """Largest error of undistorting and distorting a pixel, as a share of the longer side: 0.2 % for real
 lenses, 10 % and more where the inverse diverges."""
@@ -86,6 +89,11 @@ def check_plausible(camera: Pinhole) -> list[str]:
     """
     _check_focal_lengths(camera)
     notes = [*_check_principal_point(camera), *_check_distortion(camera)]
+    if max(camera.fx / camera.fy, camera.fy / camera.fx) > _USUAL_ASPECT:
+        notes.append(
+            f"fx {camera.fx:g} and fy {camera.fy:g} are of pixels that are not square: unless the images "
+            "were stretched, one of them and the result are wrong"
+        )
     view_deg = horizontal_view_deg(camera)
     if view_deg > WIDE_VIEW_DEG:
         notes.append(
