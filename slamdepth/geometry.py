@@ -86,6 +86,8 @@ def so3_log(R: Floats) -> Floats:
 
     Through the quaternion, which stays accurate near zero and near half a turn.
     """
+    if R.ndim == 2:
+        return _so3_log_single(R)
     quat = rotation_to_quat_xyzw(R)
     vector, w = quat[..., :3], quat[..., 3]
     length = np.linalg.norm(vector, axis=-1)
@@ -93,6 +95,26 @@ def so3_log(R: Floats) -> Floats:
     small = length < 1e-9
     factor = np.where(small, 2.0, angle / np.where(small, 1.0, length))
     return factor[..., None] * vector
+
+
+def _so3_log_single(R: Floats) -> Floats:
+    """Rotation vector ``(3,)`` of one rotation matrix, in scalar arithmetic; the same to the last bit."""
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = R.tolist()
+    squares = (r00 - r11 - r22, r11 - r00 - r22, r22 - r00 - r11, r00 + r11 + r22)
+    largest = squares.index(max(squares))
+    top = 1.0 + squares[largest]
+    xy, xz, yz = r01 + r10, r02 + r20, r12 + r21
+    wx, wy, wz = r21 - r12, r02 - r20, r10 - r01
+    candidates = ((top, xy, xz, wx), (xy, top, yz, wy), (xz, yz, top, wz), (wx, wy, wz, top))
+    x, y, z, w = candidates[largest]
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if w < 0.0:
+        norm = -norm
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    length = math.sqrt(x * x + y * y + z * z)
+    # NumPy's own arctan2: the mathematical library's may differ in the last bit
+    factor = 2.0 if length < 1e-9 else 2.0 * float(np.arctan2(length, w)) / length
+    return np.array([factor * x, factor * y, factor * z])
 
 
 def se3_exp(xi: Floats) -> Floats:
@@ -208,9 +230,10 @@ def project(camera: Camera, points_c: Floats) -> tuple[Floats, Floats]:
     """
     z = points_c[:, 2]
     safe = np.where(np.abs(z) < 1e-9, 1e-9, z)
-    u = camera.fx * points_c[:, 0] / safe + camera.cx
-    v = camera.fy * points_c[:, 1] / safe + camera.cy
-    return np.stack([u, v], axis=1), z
+    px = np.empty((len(z), 2))
+    px[:, 0] = camera.fx * points_c[:, 0] / safe + camera.cx
+    px[:, 1] = camera.fy * points_c[:, 1] / safe + camera.cy
+    return px, z
 
 
 def reprojection_errors(camera: Camera, points_c: Floats, px: Floats, nearest_m: float) -> Floats:

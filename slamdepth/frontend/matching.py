@@ -65,18 +65,26 @@ class PixelGrid:
         query, offset = _expand(height)
         row = (first[query, 1] + offset) * self._columns
         begin, end = self._starts[row + first[query, 0]], self._starts[row + last[query, 0] + 1]
-        run, offset = _expand(end - begin)
-        at, query = begin[run] + offset, query[run]
-        u, v = query_px.T.copy()
-        du, dv = u[query] - self._u[at], v[query] - self._v[at]
-        near = np.flatnonzero(du * du + dv * dv <= (radius_px * radius_px)[query])
-        return query[near], self._order[at[near]]
+        count = end - begin
+        at = _expand_from(begin, count)
+        u, v = query_px.T
+        du = np.repeat(u.take(query), count) - self._u.take(at)
+        dv = np.repeat(v.take(query), count) - self._v.take(at)
+        near = np.flatnonzero(du * du + dv * dv <= np.repeat((radius_px * radius_px).take(query), count))
+        return np.repeat(query, count).take(near), self._order.take(at.take(near))
 
 
 def _expand(lengths: Ints) -> tuple[Ints, Ints]:
     """Each item repeated ``lengths`` times: its index, and 0, 1, 2 ... within it."""
-    index = np.repeat(np.arange(len(lengths)), lengths)
-    return index, np.arange(len(index)) - (np.cumsum(lengths) - lengths)[index]
+    return np.repeat(np.arange(len(lengths)), lengths), _expand_from(np.zeros_like(lengths), lengths)
+
+
+def _expand_from(first: Ints, lengths: Ints) -> Ints:
+    """The runs of integers ``first, first + 1, ...`` of each item, one after the other."""
+    end = np.cumsum(lengths)
+    numbers = np.repeat(first - (end - lengths), lengths)
+    numbers += np.arange(len(numbers))
+    return numbers
 
 
 def best_matches(
@@ -90,10 +98,14 @@ def best_matches(
     Args:
         query, target: ``(P,)`` indices below 2^22 and 2^30.
         distance: ``(P,)`` at most :data:`slamdepth.frontend.metric.FARTHEST`.
+        ratio: nearest over second nearest, at most; not above one.
 
     Returns:
         ``(query, target, distance)`` sorted by query.
     """
+    # a pair beyond max_distance / ratio is neither a match nor a second that refuses one
+    near = np.flatnonzero(ratio * distance <= max_distance)
+    query, target, distance = query.take(near), target.take(near), distance.take(near)
     if len(query) == 0:
         return query, target, distance
     # three numbers in one: sorting integers is several times faster than sorting by three keys

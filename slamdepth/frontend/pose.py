@@ -10,25 +10,27 @@ essentially epipolar geometry with a weak depth for a new one.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slamdepth.geometry import CHI2_2DOF_95, reprojection_errors, se3_exp
 from slamdepth.types import Camera
-from slamdepth.typing import Floats
+from slamdepth.typing import Floats, Ints
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
 HUBER = 1.345
+CELLS = 8
+"""Along each side of the image: matches of one cell share their errors."""
 _NEAREST_M = 0.02
 _CONVERGED = 1e-5  # metres and radians: a hundredth of a pixel
 _ROUGHLY_CONVERGED = 2e-4  # enough to classify outliers
 _FEWEST_MATCHES = 6  # for a covariance; three determine a pose and leave no residual
 _SINGULAR = 1e-9  # least eigenvalue of the Hessian scaled to a unit diagonal
-_CELLS = 8  # along each side of the image, whose matches share their errors
 _INFLATION = 3.0
 _REWHITEN = 0.01  # metres and radians of motion that leave a point's covariance in the image alike
 
@@ -74,9 +76,8 @@ def _pixel_covariance(
     Written out by coordinate, as NumPy is slow at many tiny matrices.
     """
     x, y, z = points_c
-    right, down, forward = R_camera_world
-    along_u = (camera.fx / z)[:, None] * (right - (x / z)[:, None] * forward)
-    along_v = (camera.fy / z)[:, None] * (down - (y / z)[:, None] * forward)
+    along_u = _projected_axis(camera.fx / z, x / z, R_camera_world[0], R_camera_world[2])
+    along_v = _projected_axis(camera.fy / z, y / z, R_camera_world[1], R_camera_world[2])
     covariance_u = np.einsum("nij,nj->ni", covariance_w, along_u)
     covariance_v = np.einsum("nij,nj->ni", covariance_w, along_v)
     noise = sigma_px * sigma_px
@@ -85,6 +86,14 @@ def _pixel_covariance(
         np.einsum("ni,ni->n", along_u, covariance_v),
         np.einsum("ni,ni->n", along_v, covariance_v) + noise,
     )
+
+
+def _projected_axis(scale: Floats, slope: Floats, axis: Floats, forward: Floats) -> Floats:
+    """Derivative ``(N, 3)`` of one pixel coordinate by the point: ``scale (axis - slope forward)``."""
+    along = np.empty((len(scale), 3))
+    for k in range(3):
+        along[:, k] = scale * (axis[k] - slope * forward[k])
+    return along
 
 
 def refine_pose(
@@ -179,7 +188,7 @@ def pose_covariance(
     points_c = match.seen_from(T_camera_world)
     whitening = match.whitening(T_camera_world, points_c)
     J = match.derivatives(points_c, whitening)
-    r = np.stack(match.residual(points_c, whitening))
+    r = match.residual(points_c, whitening)
     H = J.reshape(6, -1) @ J.reshape(6, -1).T
     # translation and rotation differ by orders of magnitude: the condition of the scaled matrix counts
     unit = 1.0 / np.sqrt(np.maximum(H.diagonal(), 1e-300))
@@ -199,12 +208,21 @@ def pose_covariance(
 
 def _sums_by_cell(camera: Camera, px: Floats, values: Floats) -> Floats:
     """Sums of ``values (6, N)`` over the cells of a grid that hold any of ``px (2, N)``, ``(cells, 6)``."""
-    column = np.clip(px[0] * (_CELLS / camera.width), 0, _CELLS - 1).astype(np.int64)
-    row = np.clip(px[1] * (_CELLS / camera.height), 0, _CELLS - 1).astype(np.int64)
-    cell = _CELLS * row + column
-    count = _CELLS * _CELLS
-    sums = np.stack([np.bincount(cell, of_one, count) for of_one in values], axis=1)
-    return np.asarray(sums[np.bincount(cell, minlength=count) > 0])
+    cell = cells_of(camera, px)
+    count = CELLS * CELLS
+    # one weighted count for all rows: each has cells of its own
+    cell_of_row = cell + count * np.arange(len(values))[:, None]
+    sums = np.bincount(cell_of_row.ravel(), values.ravel(), count * len(values)).reshape(-1, count)
+    return np.asarray(sums[:, np.bincount(cell, minlength=count) > 0].T)
+
+
+def cells_of(camera: Camera, px: Floats) -> Ints:
+    """Numbers ``(N,)`` of the :data:`CELLS` x :data:`CELLS` cells of the image that ``px (2, N)`` lie in."""
+    column, row = (
+        np.minimum(np.maximum(of_one * (CELLS / size), 0.0), CELLS - 1.0).astype(np.int64)
+        for of_one, size in zip(px, (camera.width, camera.height), strict=True)
+    )
+    return np.asarray(CELLS * row + column, dtype=np.int64)
 
 
 class _Matches:
@@ -242,26 +260,33 @@ class _Matches:
         )
         a = 1.0 / np.sqrt(S00)
         b = S01 * a
-        c = 1.0 / np.sqrt(np.maximum(S11 - b * b, 1e-12))
-        return np.stack([a, -b * a * c, c])
+        W = np.empty((3, len(a)))
+        W[0] = a
+        W[2] = c = 1.0 / np.sqrt(np.maximum(S11 - b * b, 1e-12))
+        W[1] = -b * a * c
+        return W
 
-    def residual(self, points_c: Floats, whitening: Floats) -> tuple[Floats, Floats]:
-        """Whitened residuals ``(N,)`` of the two coordinates."""
-        du, dv = reprojection_errors(self.camera, points_c, self.px, _NEAREST_M)
-        return whitening[0] * du, whitening[1] * du + whitening[2] * dv
+    def residual(self, points_c: Floats, whitening: Floats) -> Floats:
+        """Whitened residuals ``(2, N)``."""
+        r = reprojection_errors(self.camera, points_c, self.px, _NEAREST_M)
+        du, dv = r
+        dv *= whitening[2]
+        dv += whitening[1] * du
+        du *= whitening[0]
+        return r
 
     def squared_residual(self, points_c: Floats, whitening: Floats) -> Floats:
         """Squared whitened residuals ``(N,)``; chi-square with two degrees of freedom for inliers."""
         ru, rv = self.residual(points_c, whitening)
-        return ru * ru + rv * rv
+        return np.asarray(ru * ru + rv * rv)
 
     def normal_equations(self, points_c: Floats, whitening: Floats, *, robust: bool) -> tuple[Floats, Floats]:
         """``(6, 6)`` and ``(6,)`` for the left perturbation (translation, rotation)."""
-        r = np.stack(self.residual(points_c, whitening))
+        r = self.residual(points_c, whitening)
         J = self.derivatives(points_c, whitening)
         Jw = J
         if robust:
-            Jw = J * (HUBER / np.maximum(np.sqrt((r * r).sum(axis=0)), HUBER))
+            Jw = J * (HUBER / np.maximum(np.sqrt(r[0] * r[0] + r[1] * r[1]), HUBER))
         return Jw.reshape(6, -1) @ J.reshape(6, -1).T, Jw.reshape(6, -1) @ r.ravel()
 
     def derivatives(self, points_c: Floats, whitening: Floats) -> Floats:
@@ -270,13 +295,19 @@ class _Matches:
         x, y = points_c[:2]
         z = np.maximum(points_c[2], _NEAREST_M)
         J = np.empty((6, 2, len(z)))
-        J[0] = whitening[:2] * (camera.fx / z)
-        J[1, 0], J[1, 1] = 0.0, whitening[2] * (camera.fy / z)
-        J[2] = J[0] * (-x / z) - J[1] * (y / z)
+        right, down, forward = J[0], J[1, 1], J[2]  # the first coordinate does not depend on y: J[1, 0] is 0
+        np.multiply(whitening[:2], camera.fx / z, out=right)
+        J[1, 0] = 0.0
+        np.multiply(whitening[2], camera.fy / z, out=down)
+        np.multiply(right, -x / z, out=forward)
+        forward[1] -= down * (y / z)
         # d(omega x p)/d omega = -[p]_x
-        J[3] = J[2] * y - J[1] * z
-        J[4] = J[0] * z - J[2] * x
-        J[5] = J[1] * x - J[0] * y
+        np.multiply(forward, y, out=J[3])
+        J[3, 1] -= down * z
+        np.multiply(right, z, out=J[4])
+        J[4] -= forward * x
+        np.multiply(right, -y, out=J[5])
+        J[5, 1] += down * x
         return J
 
 
@@ -295,25 +326,33 @@ def corner_deviation_px(
     Returns:
         The largest standard deviation in any direction; infinity where the pose is not determined.
     """
-    z = float(np.median((points_w @ T_camera_world[2, :3]) + T_camera_world[2, 3])) if len(points_w) else 0.0
-    if z <= _NEAREST_M:
+    from scipy.linalg.lapack import dposv
+
+    z = points_w @ T_camera_world[2, :3] + T_camera_world[2, 3]
+    middle = float(np.partition(z, len(z) // 2)[len(z) // 2]) if len(z) else 0.0
+    if middle <= _NEAREST_M:
         return np.inf
-    try:
-        covariance = np.linalg.inv(information)
-    except np.linalg.LinAlgError:
+    along = _corner_derivatives(camera).copy()
+    along[:3] /= middle
+    _, weighted, info = dposv(information, along)
+    if info != 0:
         return np.inf
-    u, v = (axis.ravel() for axis in np.meshgrid([0.0, camera.width - 1.0], [0.0, camera.height - 1.0]))
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    zero, one = np.zeros(4), np.ones(4)
-    along_u = camera.fx * np.stack([one / z, zero, -x / z, -x * y, 1.0 + x * x, -y])
-    along_v = camera.fy * np.stack([zero, one / z, -y / z, -1.0 - y * y, x * y, x])
-    weighted_u, weighted_v = covariance @ along_u, covariance @ along_v
-    S00, S01, S11 = (
-        (a * b).sum(axis=0) for a, b in ((along_u, weighted_u), (along_u, weighted_v), (along_v, weighted_v))
-    )
+    S = along.T @ weighted
+    S00, S01, S11 = S.diagonal()[:4], S.diagonal(4), S.diagonal()[4:]
     half_trace = 0.5 * (S00 + S11)
     largest = float((half_trace + np.sqrt(np.maximum(half_trace**2 - (S00 * S11 - S01**2), 0.0))).max())
     return float(np.sqrt(largest)) if largest > 0.0 else np.inf
+
+
+@lru_cache(maxsize=4)
+def _corner_derivatives(camera: Camera) -> Floats:
+    """Derivatives ``(6, 8)`` of the pixels of points one metre away, u of the four corners and then v."""
+    u, v = (axis.ravel() for axis in np.meshgrid([0.0, camera.width - 1.0], [0.0, camera.height - 1.0]))
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    zero, one = np.zeros(4), np.ones(4)
+    along_u = camera.fx * np.stack([one, zero, -x, -x * y, 1.0 + x * x, -y])
+    along_v = camera.fy * np.stack([zero, one, -y, -1.0 - y * y, x * y, x])
+    return np.asarray(np.hstack([along_u, along_v]))
 
 
 def usac_params(seed: int, threshold_px: float, *, confidence: float, iterations: int) -> Any:

@@ -74,26 +74,28 @@ class Localiser:
         points_c = transform(T_camera_world, points_w)
         px, z = project(camera, points_c)
         margin = 8.0
-        ok = (
+        u, v = px.T
+        at = np.flatnonzero(
             (z > NEAREST_M)
-            & (px[:, 0] > -margin)
-            & (px[:, 0] < camera.width + margin)
-            & (px[:, 1] > -margin)
-            & (px[:, 1] < camera.height + margin)
+            & (u > -margin)
+            & (u < camera.width + margin)
+            & (v > -margin)
+            & (v < camera.height + margin)
         )
-        center_w = -T_camera_world[:3, :3].T @ T_camera_world[:3, 3]
-        offset = points_w - center_w
-        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
-        ok &= np.einsum("ni,ni->n", offset, landmarks.direction_w[ids]) > 0.5 * distance
+        ids, points_c, px = ids[at], points_c[at], px[at]
+        offset = points_w[at] - (-T_camera_world[:3, :3].T @ T_camera_world[:3, 3])
+        x, y, z = offset.T
+        distance = np.maximum(np.sqrt(x * x + y * y + z * z), 1e-9)
+        ok = np.einsum("ni,ni->n", offset, landmarks.direction_w[ids]) > 0.5 * distance
         step = np.log(landmarks.distance_m[ids] / distance) / np.log(self._levels.factor)
         octave = np.rint(landmarks.octave[ids] + step).astype(np.int64)
         ok &= (octave >= -1) & (octave <= self._levels.count)
         at = np.flatnonzero(ok)
+        ids, octave = ids[at], np.minimum(np.maximum(octave[at], 0), self._levels.count - 1)
         covariance = pixel_covariance(
-            camera, T_camera_world, points_c[at], landmarks.covariance_w[ids[at]], np.zeros(len(at))
+            camera, T_camera_world, points_c[at], landmarks.covariance_w[ids], np.zeros(len(at))
         )
-        octave = np.clip(octave[at], 0, self._levels.count - 1)
-        return Visible(ids[at], px[at], covariance, octave)
+        return Visible(ids, px[at], covariance, octave)
 
     def search(
         self,
@@ -125,16 +127,16 @@ class Localiser:
         reach = np.minimum(pose_px + sigmas * np.sqrt(largest), max_px)
         # the ellipse of the pose's error plus the point's own, a du^2 + b du dv + c dv^2 < 1
         along_u, along_v = S00 + pose_px**2 / CHI2_2DOF_99, S11 + pose_px**2 / CHI2_2DOF_99
-        a, b, c = np.stack([along_v, -2.0 * S01, along_u]) / (CHI2_2DOF_99 * (along_u * along_v - S01 * S01))
+        scale = CHI2_2DOF_99 * (along_u * along_v - S01 * S01)
+        a, b, c = along_v / scale, -2.0 * S01 / scale, along_u / scale
         box = np.sqrt(CHI2_2DOF_99 * np.column_stack([along_u, along_v]))
         q, t = features.grid.pairs_within(visible.px, reach, box)
-        step = features.octave[t] - visible.octave[q]
-        ok = (step >= -1) & (step <= 1)
-        q, t = q[ok], t[ok]
-        du = features.px[:, 0][t] - visible.px[:, 0][q]
-        dv = features.px[:, 1][t] - visible.px[:, 1][q]
-        ok = (a[q] * du + b[q] * dv) * du + c[q] * dv * dv < 1.0
-        q, t = q[ok], t[ok]
+        ok = np.flatnonzero(np.abs(features.octave.take(t) - visible.octave.take(q)) <= 1)
+        q, t = q.take(ok), t.take(ok)
+        du = features.px[:, 0].take(t) - visible.px[:, 0].take(q)
+        dv = features.px[:, 1].take(t) - visible.px[:, 1].take(q)
+        ok = np.flatnonzero((a.take(q) * du + b.take(q) * dv) * du + c.take(q) * dv * dv < 1.0)
+        q, t = q.take(ok), t.take(ok)
         metric = features.metric
         distance = metric.between(self._map.landmarks.descriptor[visible.ids[q]], features.descriptors[t])
         limit = metric.strict_distance if is_strict else metric.max_distance

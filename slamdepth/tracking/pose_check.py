@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 
 from slamdepth.frontend.features import Features
-from slamdepth.frontend.pose import pose_covariance
+from slamdepth.frontend.pose import cells_of, pose_covariance
 from slamdepth.geometry import CHI2_2DOF_95
 from slamdepth.mapping.map_view import NEAREST_M, MapView
 from slamdepth.mapping.placement import PlacedBy, Placement
@@ -20,7 +20,6 @@ from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
 _FEW, _FEW_CELLS = 60, 6  # with more landmarks in more cells, chance and bad geometry are out of the question
-_CELLS = 8  # along each side of the image
 _CHANCE_LOG = math.log(1e-9)
 _EVERY = 4  # landmarks that the scene's distance is taken from
 _FASTEST_RAD_S2 = 100.0
@@ -145,7 +144,8 @@ class PoseCheck:
             return math.inf
         points_w = self._map.landmarks.position_w[ids]
         T = placement.T_camera_world
-        return max(float(np.median(points_w @ T[2, :3] + T[2, 3])), NEAREST_M)
+        depths = np.sort(points_w @ T[2, :3] + T[2, 3])
+        return max(float(depths[len(depths) // 2]), NEAREST_M)
 
     def _unearned(self, features: Features, placement: Placement) -> str:
         """Why the matches do not support the pose; empty where they do."""
@@ -170,10 +170,9 @@ class PoseCheck:
     def _has_many(self, features: Features, placement: Placement) -> bool:
         """Whether so many landmarks agree, in so many of 8 x 8 cells, that chance is out of the question."""
         px = features.px[placement.landmark_ids >= 0]
-        column = np.clip(px[:, 0] * (_CELLS / self._camera.width), 0, _CELLS - 1).astype(np.int64)
-        row = np.clip(px[:, 1] * (_CELLS / self._camera.height), 0, _CELLS - 1).astype(np.int64)
-        cells = int(np.count_nonzero(np.bincount(_CELLS * row + column)))
-        return len(px) >= _FEW and cells >= _FEW_CELLS
+        if len(px) < _FEW:
+            return False
+        return int(np.count_nonzero(np.bincount(cells_of(self._camera, px.T)))) >= _FEW_CELLS
 
     def _is_chance(self, features: Features, placement: Placement) -> bool:
         """Whether landmarks that are sought where they are not agree with about as many features."""

@@ -82,24 +82,29 @@ class PoseUncertainty:
         )
         if covariance is None:
             return None, 0.0
-        distance = max(float(np.median(points_w @ T[2, :3] + T[2, 3])), NEAREST_M)
+        depths = np.sort(points_w @ T[2, :3] + T[2, 3])
+        distance = max(float(depths[len(depths) // 2]), NEAREST_M)
         if before is not None and timestamp_s - before[0] <= _MAX_GAP_S:
-            turn, length = np.array(motion_between(before[1], T)) * (_MOTION_S / (timestamp_s - before[0]))
+            turn, length = (
+                _MOTION_S / (timestamp_s - before[0]) * of_step for of_step in motion_between(before[1], T)
+            )
             camera_rad = _CAMERA_SHARE * (turn + length / distance)
-            sigma = self._map.sigma_along_ray(ids, -T[:3, :3].T @ T[:3, 3])
-            depth_m = _DEPTH_SHARE * float(np.median(sigma)) * length
+            sigmas = np.sort(self._map.sigma_along_ray(ids, -T[:3, :3].T @ T[:3, 3]))
+            depth_m = _DEPTH_SHARE * float(sigmas[len(sigmas) // 2]) * length
             position_m2 = (camera_rad * distance) ** 2 + depth_m**2
-            covariance.flat[::7] += np.repeat([position_m2, camera_rad**2], 3)
-        variance = covariance.diagonal()
-        self.image_sigma = math.sqrt(variance[3:].sum()) + math.sqrt(variance[:3].sum()) / distance
+            covariance.flat[:21:7] += position_m2
+            covariance.flat[21::7] += camera_rad**2
+        variance = covariance.diagonal().tolist()
+        self.image_sigma = math.sqrt(sum(variance[3:])) + math.sqrt(sum(variance[:3])) / distance
         return covariance, pose_quality(covariance, distance)
 
 
 def motion_between(T_a: Floats, T_b: Floats) -> tuple[float, float]:
     """Angle in radians and length in metres of the motion between two ``T_camera_world (4, 4)``."""
-    cosine = 0.5 * (float(np.sum(T_a[:3, :3] * T_b[:3, :3])) - 1.0)
-    center_a, center_b = T_a[:3, :3].T @ T_a[:3, 3], T_b[:3, :3].T @ T_b[:3, 3]
-    return math.acos(min(max(cosine, -1.0), 1.0)), float(np.linalg.norm(center_b - center_a))
+    R_a, R_b = T_a[:3, :3], T_b[:3, :3]
+    cosine = 0.5 * (float((R_a * R_b).sum()) - 1.0)
+    way = T_b[:3, 3] @ R_b - T_a[:3, 3] @ R_a
+    return math.acos(min(max(cosine, -1.0), 1.0)), math.hypot(*way.tolist())
 
 
 def pose_quality(covariance: Floats, distance: float) -> float:
@@ -119,7 +124,7 @@ def _probability_within(covariance: Floats, radius: float) -> float:
     Its squared length is taken for a scaled chi-square of the same mean and variance (Satterthwaite 1946),
     whose cube root is nearly normal (Wilson and Hilferty 1931).
     """
-    mean, squares = float(np.trace(covariance)), float(np.sum(covariance * covariance))
+    mean, squares = float(covariance.trace()), float((covariance * covariance).sum())
     if not mean > 0.0:
         return 1.0
     spread = 2.0 / 9.0 * squares / (mean * mean)
