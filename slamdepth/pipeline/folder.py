@@ -17,8 +17,8 @@ from slamdepth.io import writable, write_text
 
 FILES = {
     "trajectory.txt": "every frame placed in the largest map, after optimisation (TUM, camera to world)",
-    "trajectory_online.txt": "each frame's pose as it was first placed, written during the run; a comment "
-    "line says where another map, and so another world frame, begins",
+    "trajectory_online.txt": "each frame's pose as it was first placed, written during the run, also where "
+    "it was withdrawn later; a comment line says where another map, and so another world frame, begins",
     "keyframes.txt": "the keyframes of trajectory.txt",
     "depth_scale.yaml": "the scale fitted to the sequence's own sensor (--depth-scale groundtruth)",
     "mesh.ply": "coloured mesh of the largest map in the frame of its first camera, metres",
