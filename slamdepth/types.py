@@ -257,6 +257,8 @@ class StepResult:
             landmarks determine it (registration of depth).
         quality: probability by ``covariance`` that the pose is within 2 % of the scene's distance and within
             2 degrees, 0 to 1; 0 where there is no covariance.
+        moving_share: share of the features that two images 0.15 s apart have in common which move together
+            against the static world, as measured last; None where it was not.
     """
 
     index: int
@@ -271,6 +273,7 @@ class StepResult:
     map_id: int = 0
     covariance: NDArray[np.float64] | None = None
     quality: float = 0.0
+    moving_share: float | None = None
 
 
 @dataclass(frozen=True)

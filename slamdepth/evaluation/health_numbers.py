@@ -10,7 +10,7 @@ import numpy as np
 
 from slamdepth.evaluation.health_facts import RunFacts
 from slamdepth.evaluation.health_odometry import correction_share, weakest_second
-from slamdepth.evaluation.health_spans import HealthSpan, SpanKind
+from slamdepth.evaluation.health_spans import HealthSpan, SpanKind, largest_moving_share
 from slamdepth.evaluation.leaps import judged_steps
 from slamdepth.types import StepResult, TrackingStatus
 
@@ -38,6 +38,8 @@ class HealthNumbers:
         correction_share: how far a pose was moved after it was first placed, of the path's length, see
             :func:`slamdepth.evaluation.health_odometry.correction_share`.
         maps: maps of the run that never met, this one included.
+        moving_share: largest median share, over a span of moving things, of features that move by themselves;
+            0 without such a span.
     """
 
     tracked_share: float | None
@@ -57,6 +59,7 @@ class HealthNumbers:
     weakest_second: float | None
     correction_share: float | None
     maps: int = 1
+    moving_share: float = 0.0
 
     @property
     def missing_share(self) -> float:
@@ -102,4 +105,5 @@ def measure_health(facts: RunFacts, spans: Sequence[HealthSpan], leaps: int) -> 
         weakest_second=weakest_second(facts),
         correction_share=correction_share(facts),
         maps=1 + len(facts.others),
+        moving_share=largest_moving_share(facts, spans),
     )

@@ -184,6 +184,24 @@ def _registration(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[Healt
     )
 
 
+def _moving_things(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """What moves by itself is in the map for a moment and in the mesh for good, and can draw a pose along.
+
+    A few of many matches are refused as outliers, so that the path is doubted only where most of what is seen
+    moves: then it is not known which of the two stands still. Reflections and the camera's own shadow move,
+    too.
+    """
+    if not numbers.moving_share:
+        return None
+    where = _where(spans, SpanKind.MOVING)
+    return Finding(
+        Verdict.DOUBTFUL if numbers.moving_share > _MOSTLY else Verdict.GOOD,
+        f"things move ({where})",
+        f"Up to {percent(numbers.moving_share)} of what is seen moves by itself: {where}. Moving things are "
+        "left out of the path as far as they are outnumbered, not out of the mesh.",
+    )
+
+
 def _short_map(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
     """A map that was started because tracking had failed, and in which it soon failed again.
 
@@ -304,6 +322,7 @@ RULES: tuple[Rule, ...] = (
     _leaps,
     _weak_tracking,
     _registration,
+    _moving_things,
     _late_start,
     _keyframe_rate,
     _refused_loops,

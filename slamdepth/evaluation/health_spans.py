@@ -20,6 +20,9 @@ LONG_S = 1.0
 GOOD_SPAN_S = 5.0
 """Shorter stretches are not called good: there is too little path to be wrong about."""
 
+MOVING_SHARE = 0.1
+"""Of the features of an image, moving together: static ones have up to 0.03 where poses are right."""
+
 _PLACED_BY_POINTS = (TrackingStatus.TRACKING, TrackingStatus.RELOCALISED)
 
 
@@ -33,6 +36,7 @@ class SpanKind(str, Enum):
     REGISTERED = "registered by depth only"
     WITHDRAWN = "pose withdrawn"
     OTHER_MAP = "in another map"
+    MOVING = "moving things"
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,7 @@ def find_spans(facts: RunFacts, leaps: Ints, weak_inliers: int) -> tuple[HealthS
         *_stretches(facts, facts.is_withdrawn, SpanKind.WITHDRAWN, _withdrawn),
         *_stretches(facts, is_elsewhere, SpanKind.OTHER_MAP, _elsewhere),
         *_badly_held(facts, weak_inliers),
+        *_moving_spans(facts),
         *_leap_spans(facts, leaps),
     ]
     return tuple(sorted(spans, key=lambda span: (span.from_s, span.to_s)))
@@ -184,6 +189,37 @@ def _weak(steps: Sequence[StepResult]) -> str:
 
 def _registered(steps: Sequence[StepResult]) -> str:
     return f"{len(steps)} frames were placed by the shape of their depth, with hardly a map point"
+
+
+def _moving_spans(facts: RunFacts) -> list[HealthSpan]:
+    """Stretches of a second and more in which much of what is seen moves by itself."""
+
+    def is_moving(step: StepResult) -> bool:
+        share = step.moving_share
+        return step.timestamp_s in facts.members and share is not None and share >= MOVING_SHARE
+
+    spans = _stretches(facts, is_moving, SpanKind.MOVING, _moving)
+    return [span for span in spans if span.duration_s >= LONG_S]
+
+
+def largest_moving_share(facts: RunFacts, spans: Sequence[HealthSpan]) -> float:
+    """The largest median share of moving features over one of the spans of moving things; 0 without any."""
+    found = [0.0]
+    for span in spans:
+        if span.kind is SpanKind.MOVING:
+            inside = [
+                step.moving_share
+                for step in facts.steps
+                if step.moving_share is not None
+                and span.from_s <= step.timestamp_s - facts.start_s < span.to_s
+            ]
+            found.append(float(np.median(inside)))
+    return max(found)
+
+
+def _moving(steps: Sequence[StepResult]) -> str:
+    share = float(np.median([step.moving_share for step in steps if step.moving_share is not None]))
+    return f"{100 * share:.0f} % of the features move together against the static scene (median)"
 
 
 def _leap_spans(facts: RunFacts, leaps: Ints) -> list[HealthSpan]:

@@ -36,7 +36,7 @@ class Placed:
         placement: its pose in the map as it is now.
         placed_by: how it was found.
         is_keyframe: True where it became a keyframe.
-        covariance, quality: of the pose, see :class:`StepResult`.
+        covariance, quality, moving_share: see :class:`StepResult`.
     """
 
     placement: Placement
@@ -44,6 +44,7 @@ class Placed:
     is_keyframe: bool
     covariance: Floats | None
     quality: float
+    moving_share: float | None
 
 
 class MapTracker(MapParts):
@@ -178,7 +179,10 @@ class MapTracker(MapParts):
     ) -> Placed:
         with self._watch.timed("uncertainty"):
             covariance, quality = self.check.uncertainty(frame.timestamp_s, features, placement)
-        return Placed(placement, placed_by, is_keyframe, covariance, quality)
+        with self._watch.timed("moving"):
+            is_near = not self.view_change.is_large
+            moving = self.check.moving(frame.timestamp_s, features, placement, is_judged=is_near)
+        return Placed(placement, placed_by, is_keyframe, covariance, quality, moving)
 
     def run_stage(self) -> None:
         """Go on with the integration of keyframes before the next frame."""

@@ -15,6 +15,7 @@ from slamdepth.geometry import CHI2_2DOF_95
 from slamdepth.mapping.map_view import NEAREST_M, MapView
 from slamdepth.mapping.placement import PlacedBy, Placement
 from slamdepth.tracking.localiser import FARTHEST_PX, POSE_PX, Localiser
+from slamdepth.tracking.moving_things import MovingThings
 from slamdepth.tracking.pose_uncertainty import PoseUncertainty, motion_between
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
@@ -71,6 +72,10 @@ class PoseCheck:
       three deviations of the last pose, which at 5 frames a second allows everything.
 
     Three frames that follow, or a second of them, confirm it; the next loss or contradiction withdraws it.
+
+    Attributes:
+        uncertainty: gives each pose its covariance and quality.
+        moving: says how much of a frame moves by itself.
     """
 
     def __init__(self, camera: Camera, map_: MapView, localiser: Localiser) -> None:
@@ -78,6 +83,7 @@ class PoseCheck:
         self._map = map_
         self._localiser = localiser
         self.uncertainty = PoseUncertainty(camera, map_)
+        self.moving = MovingThings(camera, map_)
         self._last_s = -math.inf
         self._provisional_s: list[float] = []
 
@@ -121,6 +127,7 @@ class PoseCheck:
         """The map has moved as a whole, or grown by another one: what waits counts as confirmed."""
         self._provisional_s = []
         self.uncertainty.forget_motion()
+        self.moving.forget()
 
     def _suspicion(
         self, duration_s: float, features: Features, placement: Placement, T_guess: Floats | None

@@ -149,6 +149,7 @@ class Tracker:
             map_id=self._active.id,
             covariance=None if placed is None else placed.covariance,
             quality=0.0 if placed is None else placed.quality,
+            moving_share=None if placed is None else placed.moving_share,
         )
 
     def finish(self) -> Reconstruction:

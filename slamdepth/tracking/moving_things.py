@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much of what a moving camera sees moves by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slamdepth.frontend.features import Features
+from slamdepth.frontend.moving import moving_share
+from slamdepth.geometry import invert
+from slamdepth.mapping.map_view import NEAREST_M, MapView
+from slamdepth.mapping.placement import Placement
+from slamdepth.types import Camera
+from slamdepth.typing import Floats, Ints
+
+_EVERY_S = 0.15  # what moves slowly has moved by some pixels, and most frames cost nothing
+_MAX_GAP_S = 0.4  # frames farther apart have little in common
+
+
+class MovingThings:
+    """Compares placed frames that are 0.15 s apart, see :func:`moving_share`.
+
+    What moves becomes no landmark that lasts, so it does not show among the matches with the map: features
+    that agree with no landmark are matched with those of the image before.
+
+    Args:
+        camera: that took the frames.
+    """
+
+    def __init__(self, camera: Camera, map_: MapView) -> None:
+        self._camera = camera.without_distortion()
+        self._map = map_
+        self._last: tuple[float, Features, Floats, Ints] | None = None
+        self._share: float | None = None
+
+    def forget(self) -> None:
+        """The last pose is in another world frame now."""
+        self._last = self._share = None
+
+    def __call__(
+        self, timestamp_s: float, features: Features, placement: Placement, *, is_judged: bool = True
+    ) -> float | None:
+        """Take the next placed frame.
+
+        Args:
+            features: of the frame; ``placement`` says which landmark each sees.
+            is_judged: False where frames are too far apart for features to be found nearby.
+
+        Returns:
+            The share of moving features when it was measured last; None where it was not.
+        """
+        before = self._last
+        if before is not None and is_judged and timestamp_s - before[0] < _EVERY_S:
+            return self._share
+        self._last = timestamp_s, features, placement.T_camera_world, placement.landmark_ids
+        self._share = None
+        if before is not None and is_judged and timestamp_s - before[0] <= _MAX_GAP_S:
+            self._share = self._measured(*before[1:], features, placement)
+        return self._share
+
+    def _measured(
+        self, before: Features, T_before: Floats, ids_before: Ints, now: Features, placement: Placement
+    ) -> float | None:
+        found, T_now = placement.found_ids, placement.T_camera_world
+        if len(found) == 0:
+            return None
+        depths = np.sort(self._map.landmarks.position_w[found] @ T_now[2, :3] + T_now[2, 3])
+        is_seen_again = self._map.mask(placement.landmark_ids)
+        static = np.flatnonzero(self._map.mask(ids_before)[placement.landmark_ids])
+        return moving_share(
+            self._camera,
+            before,
+            now,
+            np.flatnonzero(~is_seen_again[ids_before]),
+            np.flatnonzero(placement.landmark_ids < 0),
+            now.px[static],
+            T_now @ invert(T_before),
+            max(float(depths[len(depths) // 2]), NEAREST_M),
+        )
