@@ -46,6 +46,22 @@ def test_a_poster_that_is_carried_past_a_camera_at_rest_moves() -> None:
     assert min(moving[-15:]) > 0.08  # once the map has settled
 
 
+def test_what_was_seen_before_follows_new_landmark_ids() -> None:
+    """A map gives ids away by themselves only after minutes."""
+    run = Run(frames(range(30)))
+    tracked = run.slam._active
+    run.slam._workers.between.wait()
+    tracked.integration.run_all()
+    ids_now = np.append(np.arange(tracked.map.size)[::-1], -1)
+    last = tracked.check.moving._last
+    assert last is not None
+    tracked.check.moving.renumber(ids_now)
+    now = tracked.check.moving._last
+    assert now is not None
+    seen = last[3] >= 0
+    np.testing.assert_array_equal(now[3] + last[3], np.where(seen, tracked.map.size - 1, -2))
+
+
 def features(px: Floats) -> Features:
     """Features whose descriptors tell them apart."""
     count = len(px)

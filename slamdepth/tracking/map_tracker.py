@@ -204,3 +204,4 @@ class MapTracker(MapParts):
         if ids_now is not None:
             self.frames.renumber(ids_now)
             self.motion.renumber(ids_now)
+            self.check.moving.renumber(ids_now)

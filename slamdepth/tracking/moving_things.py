@@ -37,6 +37,12 @@ class MovingThings:
         """The last pose is in another world frame now."""
         self._last = self._share = None
 
+    def renumber(self, ids_now: Ints) -> None:
+        """Follow new landmark ids, see :meth:`Map.compact`."""
+        if self._last is not None:
+            timestamp_s, features, T_camera_world, ids = self._last
+            self._last = timestamp_s, features, T_camera_world, ids_now[ids]
+
     def __call__(
         self, timestamp_s: float, features: Features, placement: Placement, *, is_judged: bool = True
     ) -> float | None:
@@ -65,6 +71,7 @@ class MovingThings:
         if len(found) == 0:
             return None
         depths = np.sort(self._map.landmarks.position_w[found] @ T_now[2, :3] + T_now[2, 3])
+        ids_before = self._map.resolve(ids_before)
         is_seen_again = self._map.mask(placement.landmark_ids)
         static = np.flatnonzero(self._map.mask(ids_before)[placement.landmark_ids])
         return moving_share(
