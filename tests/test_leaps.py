@@ -87,6 +87,18 @@ def test_a_short_piece_between_two_gaps_is_kept_without_a_leap() -> None:
     assert unconfirmed(at(walk(), kept)) == []
 
 
+def test_one_or_two_poses_alone_are_not_confirmed_by_any_motion() -> None:
+    kept = np.r_[0, 30:80, 100:102, 120:COUNT]
+    assert unconfirmed(at(walk(), kept)) == [0, 51, 52]
+    three = np.r_[0:3, 30:COUNT]
+    assert unconfirmed(at(walk(), three)) == []
+
+
+def test_at_few_frames_a_second_a_single_lost_frame_is_no_gap() -> None:
+    kept = np.r_[0, 2:10, 11, 13:30]
+    assert unconfirmed(at(walk(), kept, fps=5.0)) == []
+
+
 def test_a_quick_turn_over_several_frames_is_kept() -> None:
     poses = walk()
     turn = np.zeros((COUNT, 6))

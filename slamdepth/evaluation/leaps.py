@@ -22,6 +22,8 @@ _GOOD = 0.5
 _SAMPLES = 50  # cameras that the scene's distance is measured from
 _FEWEST_POINTS = 10
 _CONFIRM_S = 1.0  # a hand that is pushed keeps on for less
+_FEWEST_IN_MOTION = 3  # poses: with two there is one step, and nothing to compare it with
+_GAP_STEPS = 3.0  # median steps in time: what is longer is a gap, however few frames a second there are
 _POINTS = 5000  # of the map, evenly chosen: the map of --odometry kiss-icp is a dense cloud
 
 
@@ -89,14 +91,15 @@ def find_leaps(trajectory: Trajectory, distance: float | None, quality: Floats |
 
 
 def unconfirmed_poses(trajectory: Trajectory, distance: float | None, quality: Floats | None = None) -> Bools:
-    """Poses of short pieces that only leaps join to the rest: no motion confirms them.
+    """Poses of short pieces that only leaps join to the rest, or that stand alone: no motion confirms them.
 
-    Leaps (:func:`find_leaps`) and gaps of over 0.25 s cut a trajectory into pieces. A piece of less than a
-    second that begins or ends with a leap is unconfirmed: a single pose that leaps there and back, or the
-    first poses of a map before it found itself. One between a leap and a gap is kept where most of its poses
-    are good by themselves: after a cut. The search is repeated without them, as they hid what the
-    motion around them is. The longest piece is always kept, and so is everything of a trajectory without
-    leaps.
+    One or two poses stand alone where a gap of over 0.25 s and three usual steps, or an end of the
+    trajectory, is before and behind them. Leaps (:func:`find_leaps`) and gaps of over 0.25 s cut a trajectory
+    into pieces. A piece of less than a second that begins or ends with a leap is unconfirmed: a single pose
+    that leaps there and back, or the first poses of a map before it found itself. One between a leap and a
+    gap is kept where most of its poses are good by themselves: after a cut. The search is repeated without
+    them, as they hid what the motion around them is. The longest piece is always kept, and so is everything
+    of a trajectory without leaps and gaps.
 
     Args:
         distance: of the scene, see :func:`scene_distance`; None compares rotations only.
@@ -136,7 +139,7 @@ def confirmed(trajectory: Trajectory, points_w: Floats, quality: Floats | None =
 
 
 def _short_pieces(trajectory: Trajectory, leaps: Ints, quality: Floats | None) -> Bools:
-    """``(N,)`` whether a pose is in a piece of less than a second with a leap at an end.
+    """``(N,)`` whether a pose is in a piece of less than a second with a leap at an end, or stands alone.
 
     The longest piece is in none, nor is one between a leap and a gap whose poses are good by themselves, as
     after a cut.
@@ -146,14 +149,19 @@ def _short_pieces(trajectory: Trajectory, leaps: Ints, quality: Floats | None) -
     is_cut = is_leap.copy()
     is_cut[1:-1] |= ~judged_steps(trajectory)
     is_cut[[0, -1]] = True
+    steps_s = np.diff(trajectory.timestamps_s)
+    is_gap = np.ones(len(is_cut), dtype=bool)
+    is_gap[1:-1] = steps_s > max(MAX_STEP_S, _GAP_STEPS * float(np.median(steps_s)))
     ends = np.flatnonzero(is_cut)
     first, end = ends[:-1], ends[1:]
     lasts_s = trajectory.timestamps_s[end - 1] - trajectory.timestamps_s[first]
     is_short = (lasts_s < _CONFIRM_S) & (is_leap[first] | is_leap[end])
-    is_short[np.argmax(lasts_s)] = False
+    longest = np.argmax(lasts_s)
     if quality is not None:
         is_good = [float(np.median(quality[a:b])) >= _GOOD for a, b in zip(first, end, strict=True)]
         is_short &= (is_leap[first] & is_leap[end]) | ~np.array(is_good)
+    is_short |= (end - first < _FEWEST_IN_MOTION) & is_gap[first] & is_gap[end]
+    is_short[longest] = False
     return np.repeat(is_short, end - first)
 
 
