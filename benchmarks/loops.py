@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks.command import comma_separated, errors_in_one_line, parser_of, progress_line
 from benchmarks.depth_cache import default_cache
-from benchmarks.loops_closed import closed_loops, covisibility
+from benchmarks.loops_closed import closed_loops, covisibility, taken_back
 from benchmarks.loops_injected import inject_false_loops
 from benchmarks.loops_truth import judge_loops, true_keyframes
 from benchmarks.markdown import markdown_table
@@ -45,8 +45,8 @@ from slamdepth.typing import Floats32
 
 _KEYS = ("sequence", "depth", "start", "loops", "inject")
 _HEADINGS = (
-    "sequence", "depth", "from", "tracked %", "keyframes", "closed", "true", "false", "refused", "injected",
-    "revisits", "by loop", "found", "linked %", "error on", "error off", "on/off",
+    "sequence", "depth", "from", "tracked %", "keyframes", "closed", "true", "false", "refused", "taken back",
+    "injected", "revisits", "by loop", "found", "linked %", "error on", "error off", "on/off",
 )  # fmt: skip
 
 
@@ -114,6 +114,7 @@ def run(
         "loop_closures": found.statistics.loop_closures,
         **judged,
         "refused": found.statistics.loops_refused,
+        "taken_back": taken_back(tracker),
         "injected": len(false_loops.pairs) if false_loops else 0,
         "ate": max(errors, default=None),
         "wall_s": wall_s,
@@ -139,6 +140,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         "true",
         "false",
         "refused",
+        "taken_back",
         "injected",
         "revisits",
         "by_loop",
@@ -147,7 +149,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         "seen_again",
     )
     total = {name: sum(row[name] for row in good) for name in names}
-    counts = [str(total[name]) for name in names[:8]]
+    counts = [str(total[name]) for name in names[:9]]
     ratios = [ratio for on in good if (ratio := _ratio(on, _without(rows, on))) is not None]
     worst = f"{max(ratios):.2f} at most" if ratios else "-"
     cells.append(
@@ -177,8 +179,8 @@ def _cells(on: dict[str, Any], off: dict[str, Any]) -> list[str]:
     ratio = _ratio(on, off)
     return [
         *names, f"{100 * on['tracked']:.1f}", str(on["keyframes"]), str(on["closed"]), str(on["true"]),
-        str(on["false"]), str(on["refused"]), str(on["injected"]), str(on["revisits"]), str(on["by_loop"]),
-        str(on["found"]),
+        str(on["false"]), str(on["refused"]), str(on["taken_back"]),
+        str(on["injected"]), str(on["revisits"]), str(on["by_loop"]), str(on["found"]),
         _percent(on["linked"], on["seen_again"]), *errors, "-" if ratio is None else f"{ratio:.2f}",
     ]  # fmt: skip
 

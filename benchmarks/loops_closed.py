@@ -39,3 +39,8 @@ def closed_loops(tracker: Tracker, keyframe_ids: Sequence[int]) -> list[ClosedLo
 def covisibility(tracker: Tracker, keyframe_ids: Sequence[int]) -> Ints:
     """How many landmarks each two of ``K`` keyframes share, ``(K, K)``."""
     return tracker._active.map.covisibility()[np.ix_(keyframe_ids, keyframe_ids)]
+
+
+def taken_back(tracker: Tracker) -> int:
+    """Loops that the pose graph of the largest map believed, and its observations did not."""
+    return tracker._active.integration.loops.taken_back

@@ -105,7 +105,7 @@ def verified(places: Sequence[Place], camera: Camera, config: Config, min_gap: i
     """
     map_ = Map()
     config = config.model_copy(update={"loops": config.loops.model_copy(update={"min_gap": min_gap})})
-    closer = LoopCloser(config, map_, Localiser(camera, config, map_))
+    closer = LoopCloser(camera, config, map_, Localiser(camera, config, map_))
     for k, place in enumerate(places):
         _add_keyframe(map_, camera, config, place)
         closer.places.add_vector(k, closer.describe(place.features))

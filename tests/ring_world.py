@@ -73,7 +73,7 @@ class World:
         astray: dict[int, float] | None = None,
     ) -> None:
         self.map = Map()
-        self.closer = LoopCloser(CONFIG, self.map, Localiser(CAMERA, CONFIG, self.map))
+        self.closer = LoopCloser(CAMERA, CONFIG, self.map, Localiser(CAMERA, CONFIG, self.map))
         self._ids: dict[int, int] = {}  # landmarks of the points tracked at present
         self._turn_drift, self._scale_drift, self._is_sensor = turn_drift, scale_drift, is_sensor
         self._shift_drift_m, self._alone, self._seen_from = shift_drift_m, alone, seen_from or {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,15 +13,24 @@ from numpy.typing import NDArray
 
 from slamdepth.backend.pose_graph import Edge, PoseGraphResult, optimise_pose_graph
 from slamdepth.config import Config
-from slamdepth.geometry import invert, rotation_angle_rad
+from slamdepth.geometry import Similarity, invert, rotation_angle_rad
 from slamdepth.loops.consistency import Drift, RefusedLoops
 from slamdepth.loops.edges import MeasuredLoop, odometry_edges, weakness
-from slamdepth.loops.look_alikes import ALREADY_LINKED, FEWEST_DEPTHS, depths_in_both, fits_elsewhere
+from slamdepth.loops.look_alikes import (
+    ALREADY_LINKED,
+    FEWEST_DEPTHS,
+    View,
+    depths_in_both,
+    distance_seen_m,
+    fits_elsewhere,
+)
 from slamdepth.loops.meeting import Meeting
 from slamdepth.loops.places import PlaceRecogniser
+from slamdepth.loops.trial import Sighting, Trial, part_between, parts_that_meet
 from slamdepth.mapping.map import Map, MapKeyframe
 from slamdepth.mapping.map_view import MapView
 from slamdepth.mapping.placement import Placement
+from slamdepth.types import Camera
 from slamdepth.typing import Floats, Ints
 
 log = logging.getLogger(__name__)
@@ -62,9 +71,11 @@ class LoopCloser:
         places: index of keyframes by what they look like.
         count: loops closed; a revisit that links many keyframes in a row is one.
         refused: verified loops that were not believed.
+        taken_back: those of them that the pose graph believed, and the observations did not.
     """
 
-    def __init__(self, config: Config, map_: Map, verifier: Verifier) -> None:
+    def __init__(self, camera: Camera, config: Config, map_: Map, verifier: Verifier) -> None:
+        self._camera = camera
         self._config = config
         self._map = map_
         self._verifier = verifier
@@ -74,6 +85,7 @@ class LoopCloser:
         self._last: tuple[int, int] | None = None
         self.count = 0
         self.refused = 0
+        self.taken_back = 0
 
     def describe(self, features: Any) -> NDArray[np.float32]:
         """The place vector of an image's features; any thread may ask."""
@@ -107,6 +119,22 @@ class LoopCloser:
                 return LoopClosure(candidate, scales)
         return None
 
+    def may_join(self, other: MapView, meetings: Sequence[Meeting], similarity: Similarity) -> bool:
+        """Whether this map and another one still reproject as one map; where not, a loop is taken back.
+
+        Args:
+            meetings: of keyframes of this map.
+            similarity: from this map to the other one.
+        """
+        sightings = [Sighting(meeting.keyframe, meeting.landmark_ids) for meeting in meetings]
+        there, here = parts_that_meet(self._map, other, sightings)
+        scales = np.full(len(self._map.keyframes), similarity.scale)
+        moved = here.corrected(similarity.camera(self._map.T_world_camera), scales)
+        why = Trial(self._camera, self._config.bundle, [there, here], sightings).worsened([there, moved])
+        if why:
+            self._take_back("the join of two maps", why)
+        return not why
+
     def join(self, other: LoopCloser, first: int, meetings: Sequence[Meeting]) -> None:
         """Take over keyframes and loops of a map that this map has absorbed.
 
@@ -119,6 +147,7 @@ class LoopCloser:
         self._last = None
         self.count += other.count
         self.refused += other.refused
+        self.taken_back += other.taken_back
         self._loops += [loop.renumbered(first) for loop in other._loops]
         units = self._map.units
         for meeting in meetings:
@@ -152,11 +181,7 @@ class LoopCloser:
 
     def _distance_m(self, keyframe: MapKeyframe) -> float:
         """Median distance of what a keyframe sees."""
-        seen = keyframe.landmark_ids[keyframe.landmark_ids >= 0]
-        if len(seen) == 0:
-            return 0.0
-        offset = self._map.landmarks.position_w[seen] - keyframe.center_w
-        return float(np.median(np.linalg.norm(offset, axis=1)))
+        return distance_seen_m(self._map, keyframe.T_camera_world, keyframe.landmark_ids)
 
     def verify(self, keyframe: MapKeyframe, candidate: int) -> tuple[Placement, float] | None:
         """Where ``candidate`` places ``keyframe``, and the ratio of their metres.
@@ -207,6 +232,9 @@ class LoopCloser:
                 self.refused += 1
                 log.info("loop %d-%d refused by the pose graph", edge.i, keyframe.id)
                 return None
+            if why := self._worsened(keyframe, edge, placement, result):
+                self._take_back(f"loop {edge.i}-{keyframe.id}", why)
+                return None
             scales = result.scales
             self._map.correct_similarities(result.T_world_camera, scales)
             self._refused.clear()
@@ -215,25 +243,40 @@ class LoopCloser:
         self._map.fuse_view(keyframe, placement.landmark_ids)
         return scales
 
+    def _worsened(
+        self, keyframe: MapKeyframe, edge: Edge, placement: Placement, result: PoseGraphResult
+    ) -> str:
+        """How the map would reproject worse after a correction; empty where it would not."""
+        part = part_between(self._map, *sorted((edge.i, edge.j)))
+        sightings = [Sighting(keyframe, placement.landmark_ids)]
+        trial = Trial(self._camera, self._config.bundle, [part], sightings)
+        return trial.worsened([part.corrected(result.T_world_camera, result.scales)])
+
+    def _take_back(self, what: str, why: str) -> None:
+        self.refused += 1
+        self.taken_back += 1
+        log.info("%s is taken back: %s", what, why)
+
     def _has_look_alike(self, keyframe: MapKeyframe, edge: Edge, placement: Placement) -> bool:
         """Whether the place of a loop looks like another one, before the keyframes that see it again."""
-        candidate = self.map.keyframes[edge.i]
-        views = ((keyframe, placement.T_camera_world), (candidate, candidate.T_camera_world))
+        candidate, vector = self._map.keyframes[edge.i], self.places.vector
+        here = View.of(keyframe, vector(keyframe.id))
+        views = (
+            replace(here, T_camera_world=placement.T_camera_world),
+            View.of(candidate, vector(candidate.id)),
+        )
         distance_m, fewest = self._distance_m(keyframe), self._config.loops.min_inliers
         newest = keyframe.id - self._config.loops.min_gap
-        return any(
-            fits_elsewhere(view, self.places.vector(view.id), self, T, distance_m, fewest, newest)
-            for view, T in views
-        )
+        return any(fits_elsewhere(view, self, distance_m, fewest, newest=newest) for view in views)
 
     @property
     def map(self) -> MapView:
         """The map whose loops are closed."""
         return self._map
 
-    def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
-        """Place a keyframe by matching it with the keyframe ``candidate``."""
-        return self._verifier.from_keyframe(keyframe.features, candidate, minimum=_MIN_VERIFIED)
+    def place_view(self, features: Any, candidate: int) -> Placement | None:
+        """Place an image by matching its features with the keyframe ``candidate``."""
+        return self._verifier.from_keyframe(features, candidate, minimum=_MIN_VERIFIED)
 
     def _optimised(
         self, T_old: Floats, together: Ints, new: list[Edge], looser: float = 1.0

@@ -7,7 +7,8 @@ a view then fits elsewhere as well, by the same verification.
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -37,9 +38,53 @@ class Place(Protocol):
     @property
     def places(self) -> PlaceRecogniser: ...
 
-    def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
-        """Place a keyframe of any map by matching it with the keyframe ``candidate`` of this map."""
+    def place_view(self, features: Any, candidate: int) -> Placement | None:
+        """Place an image by matching its features with the keyframe ``candidate`` of this map."""
         ...
+
+
+@dataclass(frozen=True)
+class View:
+    """An image that is said to be in a place of a map.
+
+    Attributes:
+        features: its :class:`~slamdepth.frontend.features.Features`, ``N`` of them.
+        words: its place vector ``(W,)``.
+        T_camera_world: ``(4, 4)`` where it is said to be in the map.
+        landmark_ids: ``(N,)`` landmarks of the map that it sees there, -1 for none; None where they are not
+            known, as those of a keyframe of another map.
+    """
+
+    features: Any
+    words: Floats32
+    T_camera_world: Floats
+    landmark_ids: Ints | None = None
+
+    @staticmethod
+    def of(keyframe: MapKeyframe, words: Floats32) -> View:
+        """A keyframe where its own map has it."""
+        return View(keyframe.features, words, keyframe.T_camera_world, keyframe.landmark_ids)
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Where a camera can have got to: within ``radius_m`` of ``center_w (3,)``."""
+
+    center_w: Floats
+    radius_m: float
+
+    def includes(self, T_camera_world: Floats) -> bool:
+        """Whether a camera at ``T_camera_world (4, 4)`` is within reach."""
+        center_w = invert(T_camera_world)[:3, 3]
+        return bool(np.linalg.norm(center_w - self.center_w) <= self.radius_m)
+
+
+def distance_seen_m(map_: MapView, T_camera_world: Floats, landmark_ids: Ints) -> float:
+    """Median distance in metres of landmarks ``(N,)``, -1 for none, from a camera; 0 where there are none."""
+    points_w = map_.landmarks.position_w[landmark_ids[landmark_ids >= 0]]
+    if len(points_w) == 0:
+        return 0.0
+    return float(np.median(np.linalg.norm(points_w - invert(T_camera_world)[:3, 3], axis=1)))
 
 
 def depths_in_both(
@@ -62,37 +107,36 @@ def depths_in_both(
 
 
 def fits_elsewhere(
-    keyframe: MapKeyframe,
-    words: Floats32,
+    view: View,
     place: Place,
-    T_camera_world: Floats,
     distance_m: float,
     min_inliers: int,
+    *,
     newest: int | None = None,
+    reach: Reach | None = None,
 ) -> bool:
-    """Whether a keyframe fits a map in another place than where it is said to be.
+    """Whether an image fits a map in another place than where it is said to be.
 
     Args:
-        words: place vector ``(W,)`` of the keyframe.
-        T_camera_world: ``(4, 4)`` where it is said to be in that map.
         distance_m: median distance of what it sees, in metres of that map.
         min_inliers: landmarks that must agree.
         newest: id of the last keyframe that is compared; None compares all.
+        reach: another place counts only within reach; None counts all.
     """
-    is_own = keyframe.id < len(place.map.keyframes) and place.map.keyframes[keyframe.id] is keyframe
-    shared = place.map.shared_landmarks(keyframe.landmark_ids) if is_own else None
+    ids = view.landmark_ids
+    shared = None if ids is None else place.map.shared_landmarks(ids)
     others = [
         k
-        for k, _ in place.places.query_vector(words, top_k=len(place.places))
-        if (newest is None or k <= newest)
-        and (shared is None or (k != keyframe.id and shared[k] < ALREADY_LINKED))
+        for k, _ in place.places.query_vector(view.words, top_k=len(place.places))
+        if (newest is None or k <= newest) and (shared is None or shared[k] < ALREADY_LINKED)
     ]
     for k in others[:_TRIED]:
-        placement = place.place_keyframe(keyframe, k)
+        placement = place.place_view(view.features, k)
         if placement is None or placement.inliers < min_inliers:
             continue
-        D = placement.T_camera_world @ invert(T_camera_world)
+        D = placement.T_camera_world @ invert(view.T_camera_world)
         turned, shifted_m = float(rotation_angle_rad(D[:3, :3])), float(np.linalg.norm(D[:3, 3]))
-        if turned > _ELSEWHERE[0] or shifted_m > _ELSEWHERE[1] * distance_m:
+        is_elsewhere = turned > _ELSEWHERE[0] or shifted_m > _ELSEWHERE[1] * distance_m
+        if is_elsewhere and (reach is None or reach.includes(placement.T_camera_world)):
             return True
     return False

@@ -17,7 +17,7 @@ import numpy as np
 
 from slamdepth.backend.pose_graph import Edge
 from slamdepth.geometry import Similarity, invert, rotation_angle_rad
-from slamdepth.loops.look_alikes import FEWEST_DEPTHS, Place, depths_in_both, fits_elsewhere
+from slamdepth.loops.look_alikes import FEWEST_DEPTHS, Place, View, depths_in_both, fits_elsewhere
 from slamdepth.mapping.map_keyframe import AnchoredPose, MapKeyframe
 from slamdepth.mapping.map_view import MapView
 from slamdepth.mapping.placement import Placement
@@ -100,7 +100,7 @@ def find_meeting(keyframe: MapKeyframe, home: Place, other: Place, min_inliers: 
     for candidate, score in other.places.query_vector(words, top_k=_CANDIDATES):
         if score < least:
             return None
-        placement = other.place_keyframe(keyframe, candidate)
+        placement = other.place_view(keyframe.features, candidate)
         if placement is None or placement.inliers < min_inliers:
             continue
         meeting = _meeting(keyframe, home.map, other.map, candidate, placement)
@@ -111,11 +111,12 @@ def find_meeting(keyframe: MapKeyframe, home: Place, other: Place, min_inliers: 
 
 def _is_unique(meeting: Meeting, home: Place, other: Place, words: Floats32, min_inliers: int) -> bool:
     """Whether the keyframe looks like one place of either map only, and so does the one it is placed by."""
-    candidate = meeting.pose.keyframe
+    keyframe, candidate = meeting.keyframe, meeting.pose.keyframe
+    there_m, here_m = meeting.distance_m, meeting.distance_m / meeting.scale
     views = (
-        (meeting.keyframe, words, other, meeting.pose.T_camera_world, meeting.distance_m),
-        (candidate, other.places.vector(candidate.id), other, candidate.T_camera_world, meeting.distance_m),
-        (meeting.keyframe, words, home, meeting.keyframe.T_camera_world, meeting.distance_m / meeting.scale),
+        (View(keyframe.features, words, meeting.pose.T_camera_world), other, there_m),
+        (View.of(candidate, other.places.vector(candidate.id)), other, there_m),
+        (View.of(keyframe, words), home, here_m),
     )
     return not any(fits_elsewhere(*view, min_inliers) for view in views)
 

@@ -14,10 +14,11 @@ from slamdepth.backend.resection import multi_start
 from slamdepth.config import Config
 from slamdepth.geometry import CHI2_2DOF_95, orthonormalised
 from slamdepth.mapping.map import AdjustedLandmarks, Map, MapKeyframe
+from slamdepth.mapping.observations import Observations
 from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.tracking.workers import Worker
 from slamdepth.types import Camera
-from slamdepth.typing import Ints
+from slamdepth.typing import Floats, Ints
 
 _MIN_OBSERVATIONS = 30
 _LOCAL_STEPS = (3, 3)
@@ -187,13 +188,9 @@ class Adjuster:
         self, window: list[int], fixed: list[int], landmark_ids: Ints, *, with_readout: bool = False
     ) -> _Part | None:
         used = sorted(window) + sorted(fixed)
-        index_of = np.full(self._map.size + 1, -1, dtype=np.int64)
-        index_of[landmark_ids] = np.arange(len(landmark_ids))
-        index_of[-1] = -1
         keyframes = [self._map.keyframes[k] for k in used]
-        seen = [(k, np.flatnonzero(index_of[k.landmark_ids] >= 0)) for k in keyframes]
-        obs_camera = np.concatenate([np.full(len(at), i) for i, (_, at) in enumerate(seen)])
-        if len(obs_camera) < _MIN_OBSERVATIONS:
+        seen = Observations.of(keyframes, landmark_ids, self._map.size)
+        if len(seen) < _MIN_OBSERVATIONS:
             return None
         is_fixed = np.array([k in set(fixed) or k == 0 for k in used])
         if is_fixed.all():
@@ -202,24 +199,28 @@ class Adjuster:
             is_fixed[0] = True  # nothing outside holds the window: its oldest keyframe does
         is_sensor = self._map.is_measured
         config = self._config.bundle
-        sigma_log = np.concatenate([k.sigma_log[at] for k, at in seen])
         problem = BundleProblem(
             camera=self._camera,
             T_camera_world=np.stack([k.T_camera_world for k in keyframes]),
             fixed=is_fixed,
             points_w=self._map.landmarks.position_w[landmark_ids].copy(),
-            obs_camera=obs_camera,
-            obs_point=np.concatenate([index_of[k.landmark_ids[at]] for k, at in seen]),
-            px=np.concatenate([k.features.px[at] for k, at in seen]),
-            sigma_px=np.concatenate([k.features.sigma_px[at] for k, at in seen]),
-            log_depth=np.concatenate([k.log_depth[at] for k, at in seen]),
-            sigma_log=sigma_log * (1.0 if is_sensor else config.prior_inflation),
+            obs_camera=seen.keyframe,
+            obs_point=seen.landmark,
+            px=seen.px,
+            sigma_px=seen.sigma_px,
+            log_depth=seen.log_depth,
+            sigma_log=seen.sigma_log * (1.0 if is_sensor else config.prior_inflation),
             sigma_scale=0.0 if is_sensor else config.scale_sigma,
-            px_rate=(
-                np.concatenate([self._shutter.px_rate(k, at) for k, at in seen]) if with_readout else None
-            ),
+            px_rate=self._px_rate(keyframes, seen) if with_readout else None,
         )
-        return _Part(problem, keyframes, landmark_ids, np.concatenate([at for _, at in seen]))
+        return _Part(problem, keyframes, landmark_ids, seen.feature)
+
+    def _px_rate(self, keyframes: list[MapKeyframe], seen: Observations) -> Floats:
+        """``(M, 2)`` see :attr:`BundleProblem.px_rate`."""
+        features = [seen.feature[seen.keyframe == n] for n in range(len(keyframes))]
+        return np.concatenate(
+            [self._shutter.px_rate(k, at) for k, at in zip(keyframes, features, strict=True)]
+        )
 
     def _take_over(self, part: _Part, result: BundleResult) -> None:
         """Landmarks that were not adjusted move with their anchor keyframes."""

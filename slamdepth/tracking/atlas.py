@@ -144,16 +144,22 @@ class Atlas:
                 continue
             agreeing = self._meetings[map_.id].add(meeting)
             log.info("map %d: keyframe %d sees a place of map %d", home.id, keyframe.id, map_.id)
-            if agreeing:
-                self._join(map_, agreeing)
+            if agreeing and self._join(map_, agreeing):
                 return True
         return False
 
-    def _join(self, other: MapTracker, meetings: list[Meeting]) -> None:
-        """Make the active map and another one a single map, in the world frame of the older one."""
+    def _join(self, other: MapTracker, meetings: list[Meeting]) -> bool:
+        """Make the active map and another one a single map, in the world frame of the older one.
+
+        Returns:
+            False where they would not reproject as one map; then other keyframes must meet.
+        """
         home = self.active
         home.integration.run_all()
         similarity = max(meetings, key=lambda meeting: meeting.inliers).similarity
+        if not home.integration.loops.may_join(other.map, meetings, similarity):
+            del self._meetings[other.id]
+            return False
         log.info("maps %d and %d are joined; a metre of the former is %.3g of the latter",
                  home.id, other.id, similarity.scale)  # fmt: skip
         if other.id < home.id:
@@ -166,6 +172,7 @@ class Atlas:
         self.active = other
         self.joined += 1
         self._meetings.clear()
+        return True
 
     def by_size(self) -> list[MapTracker]:
         """The maps to keep, the one with most frames first; never none."""

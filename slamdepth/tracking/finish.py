@@ -133,6 +133,8 @@ def optimise_map(
             f"the final adjustment of the whole map was left out: {count} keyframes, "
             f"at most {_MAX_KEYFRAMES} fit"
         )
+    if taken_back := integration.loops.taken_back:
+        notes.append(f"{taken_back} loops were taken back: what the map had seen contradicted them")
     dropped = integration.mapper.dropped
     if dropped:
         notes.append(f"{dropped} predicted depth maps disagreed with the map and were not used")

@@ -11,6 +11,7 @@ import numpy as np
 
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import orthonormalised
+from slamdepth.loops.look_alikes import Reach
 from slamdepth.mapping.map_keyframe import AnchoredPose
 from slamdepth.mapping.placement import PlacedBy, Placement
 from slamdepth.stopwatch import Stopwatch
@@ -95,7 +96,7 @@ class FramePlacer:
             placement = placement or parts.localiser.from_keyframe(features, newest)
         else:
             parts.relocaliser.schedule.count_frame()
-        placement = placement or parts.relocaliser.by_place(features, without=newest)
+        placement = placement or parts.relocaliser.by_place(features, without=newest, reach=self._reach())
         return self._count(frame, features, placement)
 
     def _place_wide(self, frame: Frame, raw: Features) -> tuple[Features, Features, Placement | None]:
@@ -110,7 +111,8 @@ class FramePlacer:
         parts.integration.run_all()
         parts.motion.follow_map()
         parts.view_change.is_large = True
-        found = parts.relocaliser.by_recent(wide, is_lost=not parts.motion.is_known)
+        is_lost = not parts.motion.is_known
+        found = parts.relocaliser.by_recent(wide, is_lost=is_lost, reach=self._reach())
         placement = self._count(frame, wide, found)
         if placement is None:
             parts.view_change.is_large = was_large
@@ -155,6 +157,11 @@ class FramePlacer:
         """``T_camera_world (4, 4)`` by the motion model; None where no motion is known."""
         motion = self._parts.motion
         return motion.predict(frame.timestamp_s) if motion.is_known else None
+
+    def _reach(self) -> Reach | None:
+        """Where the camera can have got to since it was placed last."""
+        motion = self._parts.motion
+        return self._parts.relocaliser.reach(motion.T_camera_world if motion.is_known else None, motion.step)
 
     def _track_motion(self, frame: Frame, features: Features) -> Placement | None:
         recent = self._parts.map.resolve(self._parts.motion.landmark_ids)

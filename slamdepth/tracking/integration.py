@@ -79,7 +79,7 @@ class KeyframeIntegration:
         self._timed = watch.timed
         self.mapper = LocalMapper(camera, config, map_, localiser)
         self.adjuster = Adjuster(camera, config, map_, shutter, workers.side)
-        self.loops = LoopCloser(config, map_, localiser)
+        self.loops = LoopCloser(camera, config, map_, localiser)
         self._view_change = localiser.view_change
         self._policy = KeyframePolicy(config, map_, localiser.view_change)
         self._waiting: list[_Waiting] = []  # oldest first

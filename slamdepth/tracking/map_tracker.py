@@ -14,7 +14,6 @@ from slamdepth.frontend.features import Features, ScaleLevels
 from slamdepth.geometry import Similarity
 from slamdepth.loops.meeting import Meeting
 from slamdepth.loops.places import PlaceRecogniser
-from slamdepth.mapping.map_keyframe import MapKeyframe
 from slamdepth.mapping.placement import PlacedBy, Placement
 from slamdepth.stopwatch import Stopwatch
 from slamdepth.tracking.frame_placer import Found, FramePlacer
@@ -112,9 +111,9 @@ class MapTracker(MapParts):
         """Index of the map's keyframes by what they look like."""
         return self.integration.loops.places
 
-    def place_keyframe(self, keyframe: MapKeyframe, candidate: int) -> Placement | None:
-        """Place a keyframe of any map by matching it with the keyframe ``candidate`` of this map."""
-        return self.localiser.from_keyframe(keyframe.features, candidate, is_lost=True)
+    def place_view(self, features: Features, candidate: int) -> Placement | None:
+        """Place an image by matching its features with the keyframe ``candidate``."""
+        return self.localiser.from_keyframe(features, candidate, is_lost=True)
 
     def move(self, similarity: Similarity) -> None:
         """Express everything in another world frame, and in its metres; no keyframe waits."""

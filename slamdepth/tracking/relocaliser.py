@@ -2,7 +2,9 @@
 """Place a frame that the motion model and the last keyframe did not place.
 
 First by keyframes that look alike, then by registering the frame's depth with that of the last keyframes
-(KISS-ICP): clouds of two places fit sooner than hundreds of their features.
+(KISS-ICP): clouds of two places fit sooner than hundreds of their features. Where places look alike hundreds
+of features fit the wrong one, too: a place counts only if the frame fits no other one within the camera's
+reach.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.registration import RegistrationConfig, depth_to_cloud, register_cloud
 from slamdepth.geometry import invert, project, se3_exp, se3_log, transform
+from slamdepth.loops.look_alikes import Reach, View, distance_seen_m, fits_elsewhere
 from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map_keyframe import MapKeyframe
 from slamdepth.mapping.map_view import MapView
@@ -40,6 +43,7 @@ _NEARER = 0.9  # of the measured depth: a landmark nearer than that would be in 
 _SCHEDULE_FRAMES = 120  # four seconds at 30 Hz: after that the camera may be anywhere
 _EVERY, _EVERY_PREDICTED = 3, 6
 _VELOCITY_DECAY = 0.5  # with every frame: how the motion went on is unknown
+_FASTEST_M_S2 = 9.8  # a hand or a vehicle does not accelerate by more than that for long
 
 
 class Relocaliser:
@@ -60,15 +64,23 @@ class Relocaliser:
         self._places = places
         self._depth = depth
         self._clouds = _CloudRegistration(camera, config, map_)
+        self._frame_s = 1.0 / camera.fps
         self.schedule = RegistrationSchedule()
 
-    def by_place(self, features: Features, *, without: int | None = None) -> Placement | None:
+    def by_place(
+        self, features: Features, *, without: int | None = None, reach: Reach | None = None
+    ) -> Placement | None:
         """Place a frame by the newest keyframe or by those that look like it.
 
         Args:
             without: keyframe that was tried before.
+            reach: where the camera can have got to; None where that is not known.
+
+        Returns:
+            None also where the frame, or the keyframe it is placed by, fits another place within reach.
         """
-        answers = self._places.query(features.place_descriptors, top_k=_CANDIDATES)
+        words = self._places.describe(features.place_descriptors)
+        answers = self._places.query_vector(words, top_k=_CANDIDATES)
         newest = len(self._map.keyframes) - 1
         for k in dict.fromkeys([newest, *(k for k, _ in answers)]):
             if k == without:
@@ -76,14 +88,15 @@ class Relocaliser:
             minimum = None if k == newest else self._config.loops.min_inliers
             placement = self._localiser.from_keyframe(features, k, minimum=minimum, is_lost=True)
             if placement is not None:
-                return replace(placement, placed_by=PlacedBy.PLACE)
+                return self._unique(features, words, placement, k, reach)
         return None
 
-    def by_recent(self, features: Features, *, is_lost: bool) -> Placement | None:
+    def by_recent(self, features: Features, *, is_lost: bool, reach: Reach | None = None) -> Placement | None:
         """Place a frame by one of the newest keyframes or by those that look like it.
 
         Args:
             is_lost: no motion leads from the frame before to this one.
+            reach: see :meth:`by_place`.
         """
         newest = len(self._map.keyframes) - 1
         for k in range(newest, max(newest - _RECENT, -1), -1):
@@ -91,8 +104,54 @@ class Relocaliser:
                 features, k, minimum=self._config.loops.min_inliers, is_lost=is_lost or k < newest
             )
             if placement is not None:
-                return replace(placement, placed_by=PlacedBy.PLACE if is_lost else PlacedBy.LAST_KEYFRAME)
-        return self.by_place(features, without=newest)
+                if not is_lost:
+                    return replace(placement, placed_by=PlacedBy.LAST_KEYFRAME)
+                words = self._places.describe(features.place_descriptors)
+                return self._unique(features, words, placement, k, reach)
+        return self.by_place(features, without=newest, reach=reach)
+
+    def _unique(
+        self, features: Features, words: Floats32, placement: Placement, k: int, reach: Reach | None
+    ) -> Placement | None:
+        """The placement by keyframe ``k``; None where it is one of several that look alike."""
+        if reach is not None and not reach.includes(placement.T_camera_world):
+            reach = None  # the recording was cut: the camera may be anywhere
+        keyframe = self._map.keyframes[k]
+        views = (
+            View(features, words, placement.T_camera_world, placement.landmark_ids),
+            View.of(keyframe, self._places.vector(k)),
+        )
+        distance_m = distance_seen_m(self._map, placement.T_camera_world, placement.landmark_ids)
+        fewest = self._config.loops.min_inliers
+        if any(fits_elsewhere(view, self, distance_m, fewest, reach=reach) for view in views):
+            log.debug("a frame that was lost fits keyframe %d, and other places as well", k)
+            return None
+        return replace(placement, placed_by=PlacedBy.PLACE)
+
+    @property
+    def map(self) -> MapView:
+        """The map that frames are placed in."""
+        return self._map
+
+    @property
+    def places(self) -> PlaceRecogniser:
+        """Index of its keyframes by what they look like."""
+        return self._places
+
+    def place_view(self, features: Features, candidate: int) -> Placement | None:
+        """Place an image by matching its features with the keyframe ``candidate``."""
+        return self._localiser.from_keyframe(features, candidate, is_lost=True)
+
+    def reach(self, T_last: Floats | None, step: Floats) -> Reach | None:
+        """Where the camera can have got to since it was placed last; None where it never was.
+
+        Args:
+            T_last: ``(4, 4)`` camera from world a frame ago; None while the camera is lost.
+            step: ``(4, 4)`` the last step, see :class:`MotionModel`.
+        """
+        if T_last is not None:
+            return _reach(T_last, step, 1, self._frame_s)
+        return self.schedule.reach(self._frame_s)
 
     def by_registration(self, frame: Frame, features: Features, T_guess: Floats | None) -> Placement | None:
         """Place a frame by registering its depth.
@@ -133,7 +192,7 @@ class RegistrationSchedule:
 
     def __init__(self) -> None:
         self._T_camera_world: Floats | None = None
-        self._motion = np.zeros(6)
+        self._step = np.eye(4)
         self._lost = 0
         self._tried = 0  # the lost frame tried last
 
@@ -144,7 +203,7 @@ class RegistrationSchedule:
             T_camera_world, step: ``(4, 4)`` each, see :class:`MotionModel`.
         """
         self._T_camera_world = T_camera_world
-        self._motion = se3_log(step)
+        self._step = step
         self._lost, self._tried = 1, 1
 
     def count_frame(self) -> None:
@@ -169,8 +228,25 @@ class RegistrationSchedule:
     def guess(self) -> Floats:
         """``T_camera_world (4, 4)`` now, had the motion decayed since the camera was lost."""
         assert self._T_camera_world is not None
-        reach = sum(_VELOCITY_DECAY**n for n in range(self._lost))
-        return se3_exp(self._motion * reach) @ self._T_camera_world
+        steps = sum(_VELOCITY_DECAY**n for n in range(self._lost))
+        return se3_exp(se3_log(self._step) * steps) @ self._T_camera_world
+
+    def reach(self, frame_s: float) -> Reach | None:
+        """Where the camera can have got to since it was lost; None where it never was.
+
+        Args:
+            frame_s: seconds from frame to frame.
+        """
+        if self._T_camera_world is None:
+            return None
+        return _reach(self._T_camera_world, self._step, self._lost, frame_s)
+
+
+def _reach(T_last: Floats, step: Floats, frames: int, frame_s: float) -> Reach:
+    """Where a camera can be so many ``frames`` after ``T_last``, where it moved by ``step``."""
+    duration_s = frames * frame_s
+    radius_m = frames * float(np.linalg.norm(step[:3, 3])) + 0.5 * _FASTEST_M_S2 * duration_s**2
+    return Reach(invert(T_last)[:3, 3], radius_m)
 
 
 class _CloudRegistration:
