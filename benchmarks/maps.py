@@ -7,8 +7,12 @@
 Each recording is spliced from pieces of sequences, with darkness between them. "elsewhere" goes from a desk
 (freiburg1_desk) to a kitchen (7-Scenes) and back by a cut: nothing ties the two. "back" leaves a rendered
 room in the dark and comes back from its other end, so that two maps meet. "aliased" does so in halls of
-identical desks, where places that look alike must not join two maps. A join is wrong where the joined map is
-off by more than 2 % of the path and 5 cm. "visible" are the frames that are not dark. Errors are Sim(3).
+identical desks, where places that look alike must not join two maps. "gaps" gets dark seven times in such a
+hall and is elsewhere each time; at the desk, in the kitchen and in the room it comes back to where it was.
+
+A join is wrong where the joined map is off by more than 2 % of the path and 5 cm. A frame that was lost is
+found again wrongly where the motion from the last frame before in its map differs from the true one by more
+than 0.3 m or 10 degrees. "visible" are the frames that are not dark. Errors are Sim(3).
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +32,7 @@ from benchmarks.command import comma_separated, errors_in_one_line, parser_of, p
 from benchmarks.depth_cache import default_cache
 from benchmarks.jobs import ROOT
 from benchmarks.loops import aliased_rooms, whole_numbers
+from benchmarks.loops_truth import FALSE_DEG, FALSE_M
 from benchmarks.markdown import markdown_table
 from benchmarks.record import environment
 from benchmarks.resume import RowFile
@@ -34,16 +40,20 @@ from benchmarks.seeded import seeded_depth_model
 from benchmarks.wild_scores import score_piece
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
+from slamdepth.geometry import invert, rotation_angle_rad
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.synth.sequence import SynthSettings, render_sequence
 from slamdepth.tracking import Tracker
-from slamdepth.types import Frame, Trajectory
+from slamdepth.types import Frame, StepResult, TrackingStatus, Trajectory
+from slamdepth.typing import Floats
 
 DARK_FRAMES = 60
 _DESK, _KITCHEN = "rgbd_dataset_freiburg1_desk", "7scenes_redkitchen_seq-01"
-_KEYS = ("recording", "depth")
+_FOUND = (TrackingStatus.RELOCALISED, TrackingStatus.REGISTERED)
+_KEYS = ("recording", "depth", "single_map")
 _HEADINGS = ("recording", "depth", "frames", "visible", "placed %", "largest map %", "maps", "joined",
-             "wrong joins", "largest map, % of path", "error of each map, m")  # fmt: skip
+             "wrong joins", "found again", "wrongly", "largest map, % of path",
+             "error of each map, m")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,20 +105,34 @@ def there_and_back(name: str, dataset: Dataset, until: int, begin: int, end: int
     return Splice(name, pieces)
 
 
-def run(splice: Splice, depth: str) -> dict[str, Any]:
-    """Track one recording: its figures."""
-    config = Config.from_dict({"depth": {"name": depth}})
+def gaps(name: str, dataset: Dataset, first: int, begins: Sequence[int], length: int) -> Splice:
+    """Frames 0 to ``first``, and after darkness ``length`` frames from each of ``begins``."""
+    pieces = [Piece(dataset, range(first))]
+    for begin in begins:
+        pieces += [Piece(None, range(DARK_FRAMES)), Piece(dataset, range(begin, begin + length))]
+    return Splice(name, tuple(pieces))
+
+
+def run(splice: Splice, depth: str, *, single_map: bool = False) -> dict[str, Any]:
+    """Track one recording: its figures.
+
+    Args:
+        single_map: start no new map where the camera stays lost.
+    """
+    config = Config.from_dict({"depth": {"name": depth}, "tracking": {"new_maps": not single_map}})
     model = seeded_depth_model(depth, config)
     given: dict[float, tuple[Dataset | None, float]] = {}
+    results = []
     with Tracker(splice.first.camera, model, config) as tracker:
         for frame, dataset, time_s in splice.frames(with_depth=depth == "sensor"):
-            tracker.step(frame)
+            results.append(tracker.step(frame))
             given[frame.timestamp_s] = dataset, time_s
         found = tracker.finish()
     maps = (found, *found.others)
     visible = sum(dataset is not None for dataset, _ in given.values())
     scores = [_score(one, given, splice.first) for one in maps]
     largest = scores[0]
+    judged = [wrong for one in maps for wrong in found_again(one.trajectory, results, given)]
     return {
         "frames": len(given),
         "visible": visible,
@@ -118,6 +142,8 @@ def run(splice: Splice, depth: str) -> dict[str, Any]:
         "joined": found.statistics.maps_joined,
         "percent_of_path": 100 * largest["sim3"] / largest["path"] if "path" in largest else None,
         "errors_m": [score.get("sim3") for score in scores],
+        "found_again": len(judged),
+        "found_wrongly": sum(judged),
         "wrong_joins": int(found.statistics.maps_joined > 0 and not largest.get("is_good", True)),
     }
 
@@ -138,6 +164,37 @@ def _score(
     return score_piece(truth, estimate, is_metric=True)
 
 
+def found_again(
+    found: Trajectory, results: Sequence[StepResult], given: dict[float, tuple[Dataset | None, float]]
+) -> list[bool]:
+    """Of each frame of a map that follows a lost one, whether it was found in a wrong place."""
+    again = {
+        after.timestamp_s
+        for before, after in pairwise(results)
+        if before.T_world_camera is None and after.status in _FOUND
+    }
+    wrong = []
+    for n in range(1, len(found)):
+        if found.timestamps_s[n] not in again:
+            continue
+        (there, before_s), (here, now_s) = (given[float(found.timestamps_s[k])] for k in (n - 1, n))
+        if here is not there or here is None:
+            wrong.append(True)
+            continue
+        D = invert(found.T_world_camera[n - 1]) @ found.T_world_camera[n]
+        true = invert(_true_pose(here, before_s)) @ _true_pose(here, now_s)
+        off_m = float(np.linalg.norm(D[:3, 3] - true[:3, 3]))
+        turned = float(rotation_angle_rad(D[:3, :3].T @ true[:3, :3]))
+        wrong.append(off_m > FALSE_M or turned > np.radians(FALSE_DEG))
+    return wrong
+
+
+def _true_pose(dataset: Dataset, time_s: float) -> Floats:
+    assert dataset.ground_truth is not None
+    nearest = np.abs(dataset.ground_truth.timestamps_s - time_s).argmin()
+    return np.asarray(dataset.ground_truth.T_world_camera[nearest])
+
+
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """One row for each recording and depth as Markdown."""
     return markdown_table(_HEADINGS, [_cells(row) for row in rows])
@@ -149,7 +206,8 @@ def _cells(row: dict[str, Any]) -> list[str]:
     return [
         row["recording"], row["depth"], str(row["frames"]), str(row["visible"]),
         f"{100 * row['placed']:.1f}", f"{100 * row['largest']:.1f}", str(row["maps"]), str(row["joined"]),
-        str(row["wrong_joins"]), "-" if percent is None else f"{percent:.2f}", errors,
+        str(row["wrong_joins"]), str(row["found_again"]), str(row["found_wrongly"]),
+        "-" if percent is None else f"{percent:.2f}", errors,
     ]  # fmt: skip
 
 
@@ -165,11 +223,16 @@ def splices(data: Path | None, seeds: Sequence[int], work: Path) -> list[Splice]
             Piece(desk, range(150, 350)),
         )
         found.append(Splice("elsewhere", pieces))
+        found.append(gaps("gaps desk", desk, 200, (150, 100, 50, 10), 40))
+        found.append(gaps("gaps kitchen", kitchen, 200, (150, 100, 50, 10), 40))
     settings = SynthSettings.from_dict({"seed": 1, "frames": 300})
     room = open_dataset(render_sequence(work / "room-640x480-300", settings))
     found.append(there_and_back("back", room, 60, 220, 20))
+    found.append(gaps("gaps room", room, 150, (110, 70, 30, 5), 40))
     for hall in aliased_rooms(seeds, 600, 320, 240, work):
-        found.append(there_and_back(hall.name, open_dataset(hall.sequence), 200, 330, 600))
+        dataset = open_dataset(hall.sequence)
+        found.append(there_and_back(hall.name, dataset, 200, 330, 600))
+        found.append(gaps(f"gaps {hall.name}", dataset, 200, range(250, 600, 50), 40))
     return found
 
 
@@ -183,6 +246,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="aliased rooms of these seeds (default: 0 to 3)")  # fmt: skip
     add("--depth", type=comma_separated, default=["sensor", "dinov2"], metavar="NAMES",
         help="with commas (default: sensor,dinov2)")  # fmt: skip
+    add("--only", type=comma_separated, default=[], metavar="NAMES", help="of the recordings, with commas")
+    add("--single-map", action="store_true", help="start no new map where the camera stays lost")
     add("--work", type=Path, default=default_cache(), metavar="DIR", help="folder of the rendered rooms")
     add("--output", "-o", type=Path, metavar="FILE", help="write the figures as JSON")
     return parser.parse_args(arguments)
@@ -198,13 +263,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     file = RowFile(asked.output, begun, {}, _KEYS)
     rows = []
     for splice in splices(data, asked.seeds, asked.work):
+        if asked.only and splice.name not in asked.only:
+            continue
         for depth in asked.depth:
             if depth == "sensor" and not all(p.dataset is None or p.dataset.has_depth for p in splice.pieces):
                 continue
-            key = {"recording": splice.name, "depth": depth}
+            key = {"recording": splice.name, "depth": depth, "single_map": asked.single_map}
             row = file.find(**key)
             if row is None:
-                row = {**key, **run(splice, depth)}
+                row = {**key, **run(splice, depth, single_map=asked.single_map)}
                 file.add(row)
                 progress_line(f"{splice.name} [{depth}]: done")
             rows.append(row)

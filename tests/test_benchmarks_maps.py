@@ -33,5 +33,6 @@ def test_a_dark_second_leaves_one_map_that_is_scored(tiny_room: Path) -> None:
     assert (row["visible"], row["maps"], row["joined"], row["wrong_joins"]) == (38, 1, 0, 0)
     assert row["placed"] == row["largest"] == 1.0
     assert row["errors_m"][0] < 0.05
+    assert (row["found_again"], row["found_wrongly"]) == (1, 0)
     text = maps.table([{"recording": "back", "depth": "sensor", **row}])
-    assert "| back | sensor | 98 | 38 | 100.0 | 100.0 | 1 | 0 | 0 |" in text
+    assert "| back | sensor | 98 | 38 | 100.0 | 100.0 | 1 | 0 | 0 | 1 | 0 |" in text
