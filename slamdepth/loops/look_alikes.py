@@ -106,6 +106,13 @@ def depths_in_both(
     return a[ok], b[ok]
 
 
+def fits(view: View, place: Place, min_inliers: int) -> bool:
+    """Whether an image fits some place of a map; ``min_inliers`` landmarks must agree."""
+    answers = place.places.query_vector(view.words, top_k=_TRIED)
+    placements = (place.place_view(view.features, k) for k, _ in answers)
+    return any(found is not None and found.inliers >= min_inliers for found in placements)
+
+
 def fits_elsewhere(
     view: View,
     place: Place,

@@ -10,9 +10,11 @@ from __future__ import annotations
 import logging
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
+from slamdepth.loops.look_alikes import View, fits
 from slamdepth.loops.meeting import Meeting, Meetings, find_meeting
 from slamdepth.mapping.map_keyframe import MapKeyframe
 from slamdepth.tracking.map_tracker import MapTracker, Placed
@@ -42,8 +44,9 @@ class Atlas:
     def __init__(self, make: Callable[[int], MapTracker], config: Config) -> None:
         self._make = make
         self._config = config
-        self.active = make(0)
-        self.maps = [self.active]
+        self.maps: list[MapTracker] = []
+        self.active = self._new(0)
+        self.maps.append(self.active)
         self.joined = 0
         self.dropped_frames = 0
         self._started = 1
@@ -89,7 +92,7 @@ class Atlas:
             return None
         if frame.timestamp_s - self._lost_since_s < self._patience_s():
             return None
-        map_ = self._make(self._started)
+        map_ = self._new(self._started)
         map_.view_change.is_large = self.active.view_change.is_large
         placed = map_.start(frame, raw)
         if placed is None:
@@ -119,8 +122,16 @@ class Atlas:
         self.active = map_
         self._meetings.clear()
 
+    def _new(self, number: int) -> MapTracker:
+        map_ = self._make(number)
+        map_.relocaliser.others = partial(self._all_but, map_)
+        return map_
+
+    def _all_but(self, map_: MapTracker) -> list[MapTracker]:
+        return [other for other in self.maps if other is not map_]
+
     def _others(self) -> list[MapTracker]:
-        return [map_ for map_ in self.maps if map_ is not self.active]
+        return self._all_but(self.active)
 
     def run_stage(self) -> None:
         """Go on with the integration of keyframes, and compare complete ones with the other maps."""
@@ -138,9 +149,15 @@ class Atlas:
         if keyframe.id == 0 or len(self.maps) == 1:
             return False
         words = home.places.vector(keyframe.id)
-        for map_ in sorted(self._others(), key=lambda other: -other.places.best_score(words))[:_LOOKED_AT]:
-            meeting = find_meeting(keyframe, home, map_, self._config.loops.min_inliers)
+        view, fewest = View.of(keyframe, words), self._config.loops.min_inliers
+        others = sorted(self._others(), key=lambda other: -other.places.best_score(words))
+        for map_ in others[:_LOOKED_AT]:
+            meeting = find_meeting(keyframe, home, map_, fewest)
             if meeting is None:
+                continue
+            # a place that a third map shows as well tells neither map from that one
+            thirds = [other for other in others if other is not map_]
+            if any(fits(view, other, fewest) for other in thirds[:_LOOKED_AT]):
                 continue
             agreeing = self._meetings[map_.id].add(meeting)
             log.info("map %d: keyframe %d sees a place of map %d", home.id, keyframe.id, map_.id)

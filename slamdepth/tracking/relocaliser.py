@@ -10,6 +10,7 @@ reach.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.registration import RegistrationConfig, depth_to_cloud, register_cloud
 from slamdepth.geometry import invert, project, se3_exp, se3_log, transform
-from slamdepth.loops.look_alikes import Reach, View, distance_seen_m, fits_elsewhere
+from slamdepth.loops.look_alikes import Place, Reach, View, distance_seen_m, fits, fits_elsewhere
 from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map_keyframe import MapKeyframe
 from slamdepth.mapping.map_view import MapView
@@ -31,6 +32,7 @@ from slamdepth.typing import Floats, Floats32
 log = logging.getLogger(__name__)
 
 _CANDIDATES = 4
+_OTHERS = 2  # maps that are asked whether a frame fits them, too
 _RECENT = 3
 _CLOUD_KEYFRAMES = 4
 _CLOUD_COLUMNS = 80  # points across a cloud, whatever the image's size
@@ -47,7 +49,12 @@ _FASTEST_M_S2 = 9.8  # a hand or a vehicle does not accelerate by more than that
 
 
 class Relocaliser:
-    """Finds the place of frames without a guess, or with an old one; changes neither map nor motion."""
+    """Finds the place of frames without a guess, or with an old one; changes neither map nor motion.
+
+    Attributes:
+        schedule: when a lost camera's depth is registered.
+        others: the other maps of the run: a frame that fits one of them, too, has no place.
+    """
 
     def __init__(
         self,
@@ -65,6 +72,7 @@ class Relocaliser:
         self._depth = depth
         self._clouds = _CloudRegistration(camera, config, map_)
         self._frame_s = 1.0 / camera.fps
+        self.others: Callable[[], Sequence[Place]] = tuple
         self.schedule = RegistrationSchedule()
 
     def by_place(
@@ -123,7 +131,11 @@ class Relocaliser:
         )
         distance_m = distance_seen_m(self._map, placement.T_camera_world, placement.landmark_ids)
         fewest = self._config.loops.min_inliers
-        if any(fits_elsewhere(view, self, distance_m, fewest, reach=reach) for view in views):
+        is_near = reach is not None and reach.radius_m < distance_m
+        others = [] if is_near else sorted(self.others(), key=lambda map_: -map_.places.best_score(words))
+        if any(fits_elsewhere(view, self, distance_m, fewest, reach=reach) for view in views) or any(
+            fits(views[0], map_, fewest) for map_ in others[:_OTHERS]
+        ):
             log.debug("a frame that was lost fits keyframe %d, and other places as well", k)
             return None
         return replace(placement, placed_by=PlacedBy.PLACE)
