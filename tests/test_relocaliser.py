@@ -48,6 +48,17 @@ def test_a_place_out_of_reach_is_no_rival(monkeypatch: pytest.MonkeyPatch) -> No
     assert relocaliser.by_place(features, reach=Reach(center_w, 2.0 * APART_M)) is None
 
 
+def test_a_frame_that_fits_a_place_of_another_map_is_put_in_neither(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The map of one desk has nothing that looks like it; the camera can have left what it saw."""
+    run = Run(frames(range(40)))
+    relocaliser, features = run.slam._active.relocaliser, run.slam.prepare(frames([2])[0]).features
+    assert relocaliser.by_place(features) is not None
+    monkeypatch.setattr(relocaliser, "others", lambda: [run.slam._active])
+    assert relocaliser.by_place(features) is None
+    here = Reach(np.zeros(3), radius_m=0.3)  # the camera cannot have left it
+    assert relocaliser.by_place(features, reach=here) is not None
+
+
 def test_reach_does_not_count_where_the_recording_was_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     """The place itself is out of reach: then so may be the other one."""
     relocaliser, features, placement = two_places(monkeypatch)
