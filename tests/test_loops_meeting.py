@@ -142,9 +142,7 @@ def test_a_place_counts_only_where_nothing_looks_like_it(alike: str, monkeypatch
         def place_view(self, features: Any, candidate: int) -> Placement | None:
             right = sees_own(other, 3)
             wrong = Placement(elsewhere @ right.T_camera_world, right.landmark_ids)
-            if (
-                features is other.keyframes[2].features
-            ):
+            if features is other.keyframes[2].features:
                 return wrong if alike == "the place itself" and candidate == 5 else None
             if candidate == 2:
                 return right
