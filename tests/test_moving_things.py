@@ -83,7 +83,7 @@ def px() -> Floats:
 
 def test_features_that_move_together_count_and_those_that_move_apart_do_not(px: Floats) -> None:
     assert share(px, px) == 0.0
-    is_inside = (np.abs(px - [160.0, 120.0]) < 60.0).all(axis=1)
+    is_inside = np.all(np.abs(px - [160.0, 120.0]) < 60.0, axis=1)
     assert share(px, px + np.where(is_inside[:, None], [8.0, 4.0], 0.0)) == pytest.approx(
         is_inside.mean(), abs=0.05
     )
