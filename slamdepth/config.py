@@ -8,6 +8,7 @@ error that lists those that do.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -103,7 +104,11 @@ class LoopConfig(_Section):
 class DepthConfig(_Section):
     """The depth prior of a keyframe."""
 
-    name: str = Field("dinov2", description="depth model by its registered name")
+    name: str = Field(
+        "auto",
+        description="depth model by its registered name; 'auto' takes the best metric one in the cache "
+        "folder, else the embedded one, 'dinov2'",
+    )
     weights: str | None = Field(
         None, min_length=1, description="its weights file; null takes the shipped or cached one"
     )
@@ -254,7 +259,16 @@ class Config(_Section):
         for section, key in _FILES:
             if isinstance(value := values[section][key], str) and value != GROUND_TRUTH:
                 values[section][key] = named(value)
+        values["depth"]["name"] = _named_depth(values["depth"]["name"], named)
         return values
+
+
+def _named_depth(name: str, named: Callable[[str], str]) -> str:
+    """The name of a depth model, with the file or folder in it, if any, as ``named`` gives it."""
+    prefix = "".join(re.findall(r"\A(?:mirrored:)*(?:onnx:|hf:)?", name))
+    path = name.removeprefix(prefix)
+    is_folder = ("/" in path or prefix.endswith("hf:")) and Path(path).expanduser().is_dir()
+    return prefix + named(path) if prefix.endswith("onnx:") or is_folder else name
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:

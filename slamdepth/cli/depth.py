@@ -36,7 +36,7 @@ def depth_command(
         Path | None,
         typer.Option("--output", "-o", metavar="DIR", help="Folder for the results. Default: depth/<name>"),
     ] = None,
-    depth: DepthOption = "dinov2",
+    depth: DepthOption = "auto",
     depth_weights: DepthWeightsOption = None,
     camera: CameraOption = None,
     max_frames: MaxFramesOption = None,
@@ -60,6 +60,8 @@ def depth_command(
     """Write depth maps: colour, 16-bit millimetres, NumPy, point cloud; for a video also an mp4.
 
     Example: slamdepth depth holiday.mp4 --stride 5 --output holiday-depth
+
+    Example: slamdepth depth room.jpg --depth hf:depth-anything/Depth-Anything-V2-Small-hf
 
     Metres need the focal length: --camera, a camera.yaml next to the images, a known sequence, or EXIF.
 

@@ -57,6 +57,7 @@ def eval_depth_command(
     Example: slamdepth eval-depth dinov2 rgbd_dataset_freiburg1_rpy --stride 20 --output rpy.json
     """
     show_log()
+    from slamdepth.depth.hub_store import is_hub_name
     from slamdepth.depth.registry import create_depth_model
     from slamdepth.errors import ConfigError, SlamdepthError
     from slamdepth.evaluation import Interval, mean_over_sets
@@ -64,7 +65,7 @@ def eval_depth_command(
     from slamdepth.pipeline.depth_data import open_depth_data, thinned
     from slamdepth.report.depth import judgement_lines, judgement_table, model_lines
 
-    if Path(model).is_dir():
+    if Path(model).is_dir() and not is_hub_name(model):
         raise ConfigError(
             f"{model}: is a folder, where a depth model's name is expected; the order is "
             "'slamdepth eval-depth MODEL DATA...'"

@@ -10,12 +10,20 @@ import typer
 
 DepthOption = Annotated[
     str,
-    typer.Option("--depth", metavar="NAME", help="Depth model; an unknown name lists all names."),
+    typer.Option(
+        "--depth",
+        metavar="NAME",
+        help="Depth model, hf:ORG/NAME of the hub or hf:FOLDER; an unknown name lists all names. Default: "
+        "auto, the best metric model in the cache folder, else dinov2",
+        show_default=False,
+    ),
 ]
 DepthWeightsOption = Annotated[
     Path | None,
     typer.Option(
-        "--depth-weights", metavar="FILE", help="Weights file of the depth model; for dinov2, of its head."
+        "--depth-weights",
+        metavar="FILE",
+        help="Weights file (or folder of the hub) of the depth model; for dinov2, of its head.",
     ),
 ]
 CameraOption = Annotated[

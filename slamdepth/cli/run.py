@@ -39,7 +39,8 @@ def run_command(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Depth model, or 'sensor'; an unknown name lists all names. Default: dinov2",
+            help="Depth model, hf:ORG/NAME of the hub, hf:FOLDER, or 'sensor'; an unknown name lists all "
+            "names. Default: auto, the best metric model in the cache folder, else dinov2",
         ),
     ] = None,
     depth_weights: DepthWeightsOption = None,

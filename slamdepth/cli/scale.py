@@ -24,7 +24,7 @@ def scale_command(
     sequence: Annotated[
         Path, typer.Argument(metavar="SEQ", help="Folder of a sequence that has sensor depth.")
     ],
-    depth: DepthOption = "dinov2",
+    depth: DepthOption = "auto",
     depth_weights: DepthWeightsOption = None,
     shift: Annotated[
         bool,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
-from slamdepth.depth.registry import create_depth_model
+from slamdepth.depth.registry import AUTO, chosen_name, create_depth_model
 from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind
 
@@ -22,6 +22,14 @@ def metric_model(model: DepthModel | None, config: Config) -> DepthModel:
     )
     check_metric(model)
     return model
+
+
+def with_chosen_model(config: Config) -> Config:
+    """``config`` with the depth model that ``auto`` stands for, so that it names what a run used."""
+    if config.depth.name != AUTO:
+        return config
+    name = chosen_name(has_weights=config.depth.weights is not None)
+    return config.model_copy(update={"depth": config.depth.model_copy(update={"name": name})})
 
 
 def check_metric(model: DepthModel) -> None:

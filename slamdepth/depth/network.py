@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slamdepth.depth.card import ModelCard
 from slamdepth.depth.preprocess import check_size, focal_px_at
-from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
+from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
 
 
 class NetworkDepth(ABC):
@@ -30,6 +30,11 @@ class NetworkDepth(ABC):
         self.card = card
         self.weights = weights
         self.device = device
+
+    def focal_px(self, camera: Camera, size: tuple[int, int]) -> float:
+        """Focal length in pixels of ``camera``'s image resized to ``size`` (rows, columns): the geometric
+        mean over both axes."""
+        return focal_px_at(camera, *size)
 
     @abstractmethod
     def infer(self, image_rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], tuple[int, int]]:
@@ -52,5 +57,5 @@ class NetworkDepth(ABC):
         check_size(frame)
         values, size = self.infer(frame.image_rgb)
         if self.kind is DepthKind.METRIC and self.card.native_focal_px is not None:
-            values = values * np.float32(focal_px_at(frame.camera, *size) / self.card.native_focal_px)
+            values = values * np.float32(self.focal_px(frame.camera, size) / self.card.native_focal_px)
         return DepthPrediction(np.ascontiguousarray(values, dtype=np.float32), self.kind)

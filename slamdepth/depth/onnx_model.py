@@ -17,16 +17,15 @@ The graph takes one image ``(1, 3, rows, columns)``, RGB, and its first output i
 from __future__ import annotations
 
 import importlib
-import json
 import math
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
-from slamdepth.depth.card import ModelCard
+from slamdepth.depth.card import ModelCard, Side, StatedFacts
 from slamdepth.depth.network import NetworkDepth
 from slamdepth.depth.preprocess import resize_rgb
 from slamdepth.errors import ConfigError, WeightsError
@@ -38,33 +37,20 @@ _KINDS = ", ".join(f'"{kind.value}"' for kind in DepthKind)
 
 Three = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
-Side = Annotated[int, Field(ge=1, le=1 << 14)]
 
 
-class OnnxAbout(BaseModel):
-    """What the author of an ONNX file says of it, as JSON.
+class OnnxAbout(StatedFacts):
+    """What the author of an ONNX file says of it, as JSON; ``input_size`` is needed where the graph leaves it
+    open.
 
     Attributes:
-        kind: what the values mean.
-        input_size: rows and columns that the network was trained with; needed where the graph leaves them
-            open.
         multiple: where the graph leaves the size open, sides are multiples of this.
-        focal_px: focal length in pixels of the training images at that size; metric depth only.
         mean, std: of the input in 0..1, for each of the channels R, G, B.
-        licence: of the weights.
-        trained_on: the data.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    kind: DepthKind
-    input_size: tuple[Side, Side] | None = None
     multiple: Side = 14
-    focal_px: float | None = Field(None, gt=0)
     mean: Three = (0.485, 0.456, 0.406)
     std: tuple[Positive, Positive, Positive] = (0.229, 0.224, 0.225)
-    licence: str = "unknown"
-    trained_on: str = "unknown"
 
 
 class OnnxDepth(NetworkDepth):
@@ -179,21 +165,14 @@ def _first_line(error: Exception) -> str:
 
 def _about(path: Path, metadata: dict[str, str]) -> OnnxAbout:
     sidecar = path.with_name(path.name + ".json")
-    origin = str(sidecar) if sidecar.is_file() else f"{path}, metadata '{METADATA_KEY}'"
-    try:
-        text = sidecar.read_text(encoding="utf-8") if sidecar.is_file() else metadata.get(METADATA_KEY)
-        if text is None:
-            raise WeightsError(
-                f"{path}: does not say what its values mean; write {sidecar} with at least "
-                f'{{"kind": K}}, K being one of {_KINDS}'
-            )
-        return OnnxAbout.model_validate(json.loads(text))
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the whole"
-        raise WeightsError(f"{origin}: {where}: {first['msg']}") from error
-    except (OSError, ValueError) as error:
-        raise WeightsError(f"{origin}: not readable as JSON: {error}") from error
+    if sidecar.is_file():
+        return OnnxAbout.read(sidecar)
+    if (text := metadata.get(METADATA_KEY)) is None:
+        raise WeightsError(
+            f"{path}: does not say what its values mean; write {sidecar} with at least "
+            f'{{"kind": K}}, K being one of {_KINDS}'
+        )
+    return OnnxAbout.parse(text, f"{path}, metadata '{METADATA_KEY}'")
 
 
 def _input_size(path: Path, session: Any, about: OnnxAbout) -> tuple[tuple[int, int], bool]:

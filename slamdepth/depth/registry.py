@@ -10,36 +10,35 @@ object is such a factory.
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Callable
 from pathlib import Path
 
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.checkpoints import check_device, check_device_name
+from slamdepth.depth.hub_models import BY_NAME
+from slamdepth.depth.hub_store import PREFIX, auto_name, is_hub_name
 from slamdepth.errors import ConfigError
 from slamdepth.registry import Registry
 from slamdepth.types import DepthKind
 
+_log = logging.getLogger(__name__)
+
 Factory = Callable[..., DepthModel]
 
 ENTRY_POINTS = "slamdepth.depth_models"
+AUTO = "auto"
 _ONNX = "onnx:"
 _MIRRORED = "mirrored:"
-_DEPTH_ANYTHING = [
-    f"depth-anything-v2-{size}{metric}"
-    for size in ("small", "base", "large")
-    for metric in ("", "-metric-indoor", "-metric-outdoor")
-]
-_OFFICIAL = ["dinov2-linear", "dinov2-linear-kitti", "dinov2-dpt", "dinov2-dpt-kitti"]
 
 _MODULES = {
     "dinov2": "slamdepth.depth.model",
     "sensor": "slamdepth.depth.sensor",
     "dinov2-mlp": "slamdepth.depth.dinov2_mlp",
-    **dict.fromkeys(_OFFICIAL, "slamdepth.depth.dinov2_official"),
-    **dict.fromkeys(_DEPTH_ANYTHING, "slamdepth.depth.depth_anything"),
+    **dict.fromkeys(BY_NAME, "slamdepth.depth.hub"),
 }
 MODELS: Registry[Factory] = Registry(
-    "depth model", modules=_MODULES, entry_points=ENTRY_POINTS, reserved=(_ONNX, _MIRRORED)
+    "depth model", modules=_MODULES, entry_points=ENTRY_POINTS, reserved=(AUTO, PREFIX, _ONNX, _MIRRORED)
 )
 
 
@@ -56,18 +55,29 @@ def register(name: str) -> Callable[[Factory], Factory]:
 
 
 def depth_model_names() -> list[str]:
-    """Every name :func:`create_depth_model` takes, the default first; ``onnx:FILE`` stands for any file,
-    ``mirrored:MODEL`` for any of the others."""
+    """Every name :func:`create_depth_model` takes, the default first; ``hf:ORG/NAME`` stands for any model of
+    the hub or local folder of one, ``onnx:FILE`` for any file, ``mirrored:MODEL`` for any of the others."""
     names = MODELS.names()
     own, others = names[: len(_MODULES)], names[len(_MODULES) :]
-    return [*own, f"{_ONNX}FILE", *others, f"{_MIRRORED}MODEL"]
+    return [AUTO, *own, f"{PREFIX}ORG/NAME", f"{PREFIX}FOLDER", f"{_ONNX}FILE", *others, f"{_MIRRORED}MODEL"]
 
 
 def is_depth_model_name(name: str) -> bool:
-    """Whether :func:`create_depth_model` takes ``name``; an ``onnx:`` file need not be there."""
+    """Whether :func:`create_depth_model` takes ``name``; the files that it stands for need not be there."""
     if name.startswith(_MIRRORED):
         return is_depth_model_name(name.removeprefix(_MIRRORED))
-    return name.startswith(_ONNX) or name in depth_model_names()
+    return name.startswith(_ONNX) or is_hub_name(name) or name in depth_model_names()
+
+
+def chosen_name(*, has_weights: bool = False) -> str:
+    """The model that ``auto`` stands for here and now; logs which and why.
+
+    Args:
+        has_weights: whether the user names a weights file, which then is one of the embedded model.
+    """
+    name, why = ("dinov2", "the embedded model, as its weights file is given") if has_weights else auto_name()
+    _log.info("depth model '%s' is '%s': %s", AUTO, name, why)
+    return name
 
 
 def create_depth_model(
@@ -76,7 +86,8 @@ def create_depth_model(
     """Build the depth model called ``name``.
 
     Args:
-        name: one of :func:`depth_model_names`.
+        name: one of :func:`depth_model_names`, or a folder with a model in the hub's layout. ``auto`` takes
+            the best metric model in the cache folder, else the embedded one, and logs which.
         device: where its network runs: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, checked for every model.
         seed: for models with something random; the ones here have nothing.
         weights: its weights file; default: by its official name from the cache folder.
@@ -99,6 +110,12 @@ def create_depth_model(
 
         return create(name.removeprefix(_ONNX), device=device, seed=seed)
     check_device(device)
+    if name == AUTO:
+        name = chosen_name(has_weights=weights is not None)
+    if is_hub_name(name):
+        from slamdepth.depth.hub import HubDepth
+
+        return HubDepth.load(name, weights=None if weights is None else Path(weights), device=device)
     model = _call(name, MODELS.get(name, depth_model_names), device, seed, weights)
     plugin = MODELS.plugin(name)
     if plugin is not None and not (isinstance(model, DepthModel) and isinstance(model.kind, DepthKind)):

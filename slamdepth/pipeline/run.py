@@ -17,6 +17,7 @@ from slamdepth.config import Config, merge
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.depth.base import DepthModel, is_sensor
+from slamdepth.depth.metric import with_chosen_model
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.depth.scale_file import write_scale
 from slamdepth.errors import DatasetError, OutputError, SlamdepthError
@@ -67,7 +68,7 @@ def run(
         sequence: a video, a folder of images, or a folder in the layout of TUM RGB-D or 7-Scenes.
         output: run folder. Default: ``runs/<sequence>-<time>``.
         depth: name of the depth model, see :func:`slamdepth.create_depth_model`; ``"sensor"`` takes the
-            sequence's own depth. Default: as ``config`` says, which is ``"dinov2"`` unless changed.
+            sequence's own depth. Default: as ``config`` says, which is ``"auto"`` unless changed.
         camera: a ``camera.yaml`` with the intrinsics. Default: as the sequence says.
         config: every other setting, or a YAML file with settings. Default: ``Config()``.
         max_frames: stop after this many frames. Default: all.
@@ -141,6 +142,7 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     """Open and check everything that a run needs, what costs least first."""
     from slamdepth.tracking import create_tracker
 
+    config = with_chosen_model(config)
     dataset = open_dataset(options.sequence, options.camera_file)
     indices = options.indices(len(dataset))
     check_scale_options(dataset, config, indices)

@@ -24,7 +24,7 @@ def images(number: int) -> str:
 
 def public_name(model: DepthModel) -> str:
     """The model's name without folders of this machine, since results are passed on."""
-    return re.sub(r":(?!onnx:).*/", ":", model.name)  # mirrored:onnx:FILE has two names before its path
+    return re.sub(r"onnx:.*/", "onnx:", model.name)
 
 
 def intrinsics_entry(intrinsics: Intrinsics) -> dict[str, Any]:

@@ -36,7 +36,7 @@ class DepthMapOptions:
 
     source: Path
     output: Path | None = None
-    depth: str = "dinov2"
+    depth: str = "auto"
     weights: Path | None = None
     camera_file: Path | None = None
     stride: int = 1
