@@ -10,12 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from depth_checkpoint_files import (
-    depth_anything_layout,
-    frame_of,
-    random_tensors,
-    write_random_files,
-)
 from killed_training import tiny_backbone
 from pretend_cuda import MixedDevicesError, pretend_cuda
 from training_places import make_place
@@ -67,19 +61,15 @@ def test_the_default_model(monkeypatch: pytest.MonkeyPatch) -> None:
             assert one.predict(with_gravity).values.shape == (240, 320)
 
 
-@pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cache folder with random files in the official layouts."""
-    folder = tmp_path_factory.mktemp("cache")
-    write_random_files(folder, random_tensors(depth_anything_layout(384, 12, 64, (48, 96, 192, 384))))
-    return folder
+@pytest.mark.parametrize("family", ["relative", "zoedepth", "depth_pro"])
+def test_models_of_the_hub(family: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    pytest.importorskip("transformers", reason="needs pip install 'slamdepth[hub]'")
+    from hub_folders import frame_of, save_tiny
 
-
-@pytest.mark.parametrize("name", ["depth-anything-v2-small", "dinov2-linear", "dinov2-dpt"])
-def test_published_checkpoints(name: str, monkeypatch: pytest.MonkeyPatch, published: Path) -> None:
-    monkeypatch.setenv("SLAMDEPTH_CACHE", str(published))
+    save_tiny(tmp_path, family)
     with pretend_cuda(monkeypatch):
-        assert create_depth_model(name, device="cuda").predict(frame_of(focal=60.0)).values.shape == (48, 64)
+        model = create_depth_model(f"hf:{tmp_path}", device="cuda")
+        assert model.predict(frame_of()).values.shape == (48, 64)
 
 
 def test_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

