@@ -11,11 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import transformers
-
-from slamdepth.types import Camera, Frame
 
 VIT = {"hidden_size": 24, "num_hidden_layers": 4, "num_attention_heads": 3}
 IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
@@ -130,11 +127,6 @@ FAMILIES: dict[str, tuple[Callable[[], Any], dict[str, Any]]] = {
     "tipsv2_dpt": (tipsv2, {"do_normalize": False, "size": side(56), "resample": 2}),
 }  # fmt: skip
 """Configuration and image processor of each family."""
-
-
-def frame_of(width: int = 64, height: int = 48, *, fx: float = 60.0, fy: float | None = None) -> Frame:
-    image = np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
-    return Frame(3, 0.1, image, Camera(width, height, fx, fy or fx, width / 2, height / 2))
 
 
 def save_tiny(folder: Path, family: str) -> torch.nn.Module:

@@ -14,7 +14,8 @@ import torch
 
 transformers = pytest.importorskip("transformers", reason="needs pip install 'slamdepth[hub]'")
 
-from hub_folders import FAMILIES, frame_of, save_tiny  # noqa: E402
+from depth_frames import frame_of  # noqa: E402
+from hub_folders import FAMILIES, save_tiny  # noqa: E402
 from safetensors.torch import load_file, save_file  # noqa: E402
 
 from slamdepth.depth import hub_store  # noqa: E402
@@ -119,10 +120,10 @@ def test_a_short_name_has_the_facts_of_the_table(tiny: Any, cache: Path) -> None
     assert model.card.native_focal_px == pytest.approx(596.1, abs=0.1)
     assert (model.card.licence, model.card.trained_on) == ("Apache-2.0", "Hypersim")
     assert model.weights[0].name == "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
-    once, twice = model.predict(frame_of(fx=50.0)).values, model.predict(frame_of(fx=100.0)).values
+    once, twice = model.predict(frame_of(focal=50.0)).values, model.predict(frame_of(focal=100.0)).values
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-5)
     by_repo = create_depth_model(f"hf:{model.weights[0].name}")
-    np.testing.assert_array_equal(by_repo.predict(frame_of(fx=50.0)).values, once)
+    np.testing.assert_array_equal(by_repo.predict(frame_of(focal=50.0)).values, once)
     mirrored = create_depth_model(f"mirrored:{INDOOR}")
     assert mirrored.predict(frame_of()).values.shape == (48, 64)
 
@@ -134,22 +135,22 @@ def test_depth_of_the_training_camera_is_taken_as_predicted(tiny: Any, tmp_path:
     values, size = model.infer(frame_of().image_rgb)
     assert size == (70, 98)  # the focal length there is 60 * sqrt(70 * 98 / (48 * 64)) px
     expected = values * np.sqrt(70 * 98 / (48 * 64))
-    np.testing.assert_allclose(model.predict(frame_of(fx=60.0)).values, expected, rtol=1e-5)
+    np.testing.assert_allclose(model.predict(frame_of(focal=60.0)).values, expected, rtol=1e-5)
 
 
 def test_depth_pro_scales_with_the_focal_length_in_image_widths(tiny: Any) -> None:
     model = HubDepth.load(f"hf:{tiny('depth_pro')[0]}")
     values, _ = model.infer(frame_of().image_rgb)
     expected = values * (60.0 / 64)
-    np.testing.assert_allclose(model.predict(frame_of(fx=60.0)).values, expected, rtol=1e-5)
-    np.testing.assert_allclose(model.predict(frame_of(fx=60.0, fy=90.0)).values, expected, rtol=1e-5)
+    np.testing.assert_allclose(model.predict(frame_of(focal=60.0)).values, expected, rtol=1e-5)
+    np.testing.assert_allclose(model.predict(frame_of(focal=60.0, focal_y=90.0)).values, expected, rtol=1e-5)
 
 
 def test_an_unknown_focal_length_is_said_in_the_log(tiny: Any, caplog: pytest.LogCaptureFixture) -> None:
     model = HubDepth.load(f"hf:{tiny('metric')[0]}")
     assert "focal length it was trained at is not known" in caplog.text
-    once = model.predict(frame_of(fx=50.0)).values
-    np.testing.assert_array_equal(model.predict(frame_of(fx=100.0)).values, once)
+    once = model.predict(frame_of(focal=50.0)).values
+    np.testing.assert_array_equal(model.predict(frame_of(focal=100.0)).values, once)
 
 
 def test_relative_is_never_taken_for_metric(tiny: Any, cache: Path, tmp_path: Path) -> None:

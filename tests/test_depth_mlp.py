@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from depth_checkpoint_files import frame_of
+from depth_frames import frame_of
 from safetensors.torch import save_file
 from torch.nn import functional as F
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from depth_frames import frame_of
 from killed_training import tiny_backbone
 from pretend_cuda import MixedDevicesError, pretend_cuda
 from training_places import make_place
@@ -64,7 +65,7 @@ def test_the_default_model(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("family", ["relative", "zoedepth", "depth_pro"])
 def test_models_of_the_hub(family: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     pytest.importorskip("transformers", reason="needs pip install 'slamdepth[hub]'")
-    from hub_folders import frame_of, save_tiny
+    from hub_folders import save_tiny
 
     save_tiny(tmp_path, family)
     with pretend_cuda(monkeypatch):

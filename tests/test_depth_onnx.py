@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from depth_checkpoint_files import frame_of
+from depth_frames import frame_of
 
 from slamdepth.depth import onnx_model
 from slamdepth.depth.base import DepthModel

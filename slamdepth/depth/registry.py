@@ -32,13 +32,14 @@ _ONNX = "onnx:"
 _MIRRORED = "mirrored:"
 
 _MODULES = {
+    AUTO: __name__,  # stands for one of the others, see chosen_name
     "dinov2": "slamdepth.depth.model",
     "sensor": "slamdepth.depth.sensor",
     "dinov2-mlp": "slamdepth.depth.dinov2_mlp",
     **dict.fromkeys(BY_NAME, "slamdepth.depth.hub"),
 }
 MODELS: Registry[Factory] = Registry(
-    "depth model", modules=_MODULES, entry_points=ENTRY_POINTS, reserved=(AUTO, PREFIX, _ONNX, _MIRRORED)
+    "depth model", modules=_MODULES, entry_points=ENTRY_POINTS, reserved=(PREFIX, _ONNX, _MIRRORED)
 )
 
 
@@ -59,7 +60,7 @@ def depth_model_names() -> list[str]:
     the hub or local folder of one, ``onnx:FILE`` for any file, ``mirrored:MODEL`` for any of the others."""
     names = MODELS.names()
     own, others = names[: len(_MODULES)], names[len(_MODULES) :]
-    return [AUTO, *own, f"{PREFIX}ORG/NAME", f"{PREFIX}FOLDER", f"{_ONNX}FILE", *others, f"{_MIRRORED}MODEL"]
+    return [*own, f"{PREFIX}ORG/NAME", f"{PREFIX}FOLDER", f"{_ONNX}FILE", *others, f"{_MIRRORED}MODEL"]
 
 
 def is_depth_model_name(name: str) -> bool:
