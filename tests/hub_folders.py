@@ -134,12 +134,12 @@ def save_tiny(folder: Path, family: str) -> torch.nn.Module:
     make, preprocessor = FAMILIES[family]
     torch.manual_seed(0)
     config = make()
-    network = transformers.MODEL_FOR_DEPTH_ESTIMATION_MAPPING[type(config)](config).eval()
+    network: torch.nn.Module = transformers.MODEL_FOR_DEPTH_ESTIMATION_MAPPING[type(config)](config).eval()
     for name, value in network.named_parameters():
         if value.ndim > 1:  # larger than transformers' own, so that depth differs from pixel to pixel
             torch.nn.init.normal_(value, std=value[0].numel() ** -0.5)
         if name.endswith(("head.conv3.bias", "head.head.4.bias", "head.layers.4.bias")):
             torch.nn.init.constant_(value, 1.0)  # away from where activations are flat
-    network.save_pretrained(folder)
+    network.save_pretrained(folder)  # type: ignore[operator]
     (folder / "preprocessor_config.json").write_text(json.dumps(preprocessor))
     return network

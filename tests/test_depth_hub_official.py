@@ -16,6 +16,7 @@ import torch
 from depth_frames import frame_of
 from torch import Tensor
 
+from slamdepth.depth.card import card_of
 from slamdepth.depth.hub_official import depth_anything_config, depth_anything_tensors
 from slamdepth.depth.layout import dinov2_layout
 from slamdepth.errors import WeightsError
@@ -130,7 +131,9 @@ def test_a_file_in_the_cache_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert isinstance(model, HubDepth)
         assert (model.name, model.kind) == (name, kind)
         assert model.predict(frame_of()).values.shape == (48, 64)
-    assert model.card.range_m == (0.0, 20.0)
+    card = card_of(model)
+    assert card is not None
+    assert card.range_m == (0.0, 20.0)
     with pytest.raises(WeightsError, match="named as a metric model"):
         create_depth_model(RELATIVE, weights=metric_file)
     with pytest.raises(WeightsError, match="takes a folder with"):

@@ -97,7 +97,7 @@ def test_mirrored_models_are_created_by_name(monkeypatch: pytest.MonkeyPatch) ->
     assert "mirrored:MODEL" in depth_model_names()
     names = ["dinov2", "mirrored:dinov2", "mirrored:onnx:net.onnx", "mirrored:right", "right"]
     assert [is_depth_model_name(name) for name in names] == [True, True, True, False, False]
-    with pytest.raises(ConfigError, match="unknown depth model 'right'; choose from: dinov2"):
+    with pytest.raises(ConfigError, match="unknown depth model 'right'; choose from: auto, dinov2"):
         create_depth_model("mirrored:right")
 
 

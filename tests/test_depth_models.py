@@ -42,7 +42,7 @@ def tiny_model() -> Dinov2Depth:
 
 def test_names_and_unknown_name() -> None:
     assert {"dinov2", "sensor"} <= set(depth_model_names())
-    with pytest.raises(ConfigError, match=r"unknown depth model 'midas'; choose from: dinov2.*sensor"):
+    with pytest.raises(ConfigError, match=r"unknown depth model 'midas'; choose from: auto, dinov2.*sensor"):
         create_depth_model("midas")
 
 
