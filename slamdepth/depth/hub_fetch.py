@@ -221,22 +221,30 @@ def _fetch(remote: _Remote, target: Path, repo: str) -> str:
 
 
 def _download(http_get: Any, remote: _Remote, part: Path, headers: dict[str, str]) -> None:
+    """Download into ``part``, going on from what is there, as long as each attempt brings some of it."""
+    whole = remote.size_bytes
     size = part.stat().st_size if part.is_file() else 0
-    if remote.size_bytes is not None and size > remote.size_bytes:
+    if whole is not None and size > whole:
         part.unlink()
         size = 0
-    try:
-        with part.open("ab") as file:
-            http_get(
-                remote.url, file, resume_size=size, headers=headers, expected_size=remote.size_bytes,
-                displayed_filename=part.name.rsplit(".", 2)[0],
-            )  # fmt: skip
-    except Exception as error:  # of whichever HTTP library this version uses
-        done = part.stat().st_size if part.is_file() else 0
-        raise WeightsError(
-            f"{remote.url}: the download broke off after {done / 1e6:.1f} MB: {_reason(error)}; the same "
-            "command goes on from there"
-        ) from error
+    while True:
+        before = size
+        try:
+            with part.open("ab") as file:
+                http_get(
+                    remote.url, file, resume_size=size, headers=headers, expected_size=whole,
+                    displayed_filename=part.name.rsplit(".", 2)[0],
+                )  # fmt: skip
+            return
+        except Exception as error:  # of whichever HTTP library this version uses
+            size = part.stat().st_size
+            if before < size and (whole is None or size < whole):
+                _log.info("%s: broke off after %d bytes, going on: %s", remote.url, size, _reason(error))
+                continue
+            raise WeightsError(
+                f"{remote.url}: the download broke off after {size / 1e6:.1f} MB: {_reason(error)}; the same "
+                "command goes on from there"
+            ) from error
 
 
 def _matches(path: Path, checksum: str) -> bool:
