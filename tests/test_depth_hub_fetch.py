@@ -261,6 +261,22 @@ def test_divided_weights_are_pulled_part_by_part(hub: Hub) -> None:
         hub_fetch.pull(hub_store.reference_of(f"hf:{REPO}@{LATER}"))
 
 
+def test_what_another_program_left_in_the_hubs_cache_is_used(hub: Hub, tmp_path: Path) -> None:
+    snapshot = tmp_path / "hf" / "models--me--tiny" / "snapshots" / COMMIT
+    snapshot.mkdir(parents=True)
+    (snapshot.parents[1] / "refs").mkdir()
+    (snapshot.parents[1] / "refs" / "main").write_text(COMMIT)
+    (snapshot / "config.json").write_bytes(hub.files[f"{REPO}/config.json"])
+    reference = hub_store.reference_of(f"hf:{REPO}")
+    assert hub_store.find_folder(reference) is None  # without weights it is no model
+    (snapshot / "model.safetensors").write_bytes(WEIGHTS)
+    assert hub_store.find_folder(reference) == snapshot
+    assert hub_store.find_folder(hub_store.reference_of(f"hf:{REPO}@{LATER}")) is None
+    folder = hub_fetch.pull(reference)
+    assert hub_store.find_folder(reference) == folder
+    assert gets(hub) == [("preprocessor_config.json", None)]  # the others were copied
+
+
 def test_the_command_line_uses_the_settings_of_the_hub(hub: Hub, tmp_path: Path) -> None:
     environment = {
         **os.environ, "HF_ENDPOINT": hub.url, "SLAMDEPTH_CACHE": str(tmp_path / "mine"),

@@ -17,6 +17,7 @@ from depth_frames import frame_of
 from torch import Tensor
 
 from slamdepth.depth.card import card_of
+from slamdepth.depth.checkpoints import read_checkpoint
 from slamdepth.depth.hub_official import depth_anything_config, depth_anything_tensors
 from slamdepth.depth.layout import dinov2_layout
 from slamdepth.errors import WeightsError
@@ -142,6 +143,19 @@ def test_a_file_in_the_cache_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
     torch.save(tensors, metric_file)
     with pytest.raises(WeightsError, match=r"1 missing \(first: head\.conv1\.bias\)"):
         create_depth_model(INDOOR)
+
+
+@pytest.mark.parametrize("ending", ["pth", "safetensors"])
+def test_unreadable_files_are_one_line(ending: str, tmp_path: Path) -> None:
+    path = tmp_path / f"depth_anything_v2_vits.{ending}"
+    for content in (b"", b"hello", b"PK\x03\x04" + bytes(100)):
+        path.write_bytes(content)
+        with pytest.raises(WeightsError, match=r"not a readable weights file: [A-Z]") as error:
+            read_checkpoint(path)
+        assert "\n" not in str(error.value)
+    torch.save({"epoch": 3}, tmp_path / "other.pth")
+    with pytest.raises(WeightsError, match="'epoch' is none"):
+        read_checkpoint(tmp_path / "other.pth")
 
 
 def test_another_layout_is_refused() -> None:

@@ -30,6 +30,7 @@ INDOOR, RELATIVE = "depth-anything-v2-small-metric-indoor", "depth-anything-v2-s
 def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setenv("SLAMDEPTH_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(hub_store, "has_extra", lambda: True)
+    monkeypatch.setattr(hub_store, "_in_the_hubs_cache", lambda reference: None)
     return tmp_path / "cache"
 
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     Module = TypeVar("Module", bound=nn.Module)
 
-_TRANSFORMERS_PREFIX = "backbone.embeddings."
-
 
 def find_checkpoint(model: str, file_names: Sequence[str], given: str | Path | None) -> Path:
     """The weights file of ``model``: ``given``, else the first of ``file_names`` in the cache.
@@ -79,7 +77,6 @@ def load_strictly(
     tensors: Mapping[str, Tensor],
     origin: str,
     *,
-    unused: Mapping[str, tuple[int, ...]] | None = None,
     device: str = "cpu",
 ) -> Module:
     """Build a network and load ``tensors`` into it: every one it needs, and no other.
@@ -89,8 +86,6 @@ def load_strictly(
             must keep no tensors outside its state.
         tensors: by name.
         origin: the file, named in errors.
-        unused: shapes by name of tensors that official files have and inference does not need; they may be
-            there.
         device: where the network is put.
 
     Returns:
@@ -104,13 +99,8 @@ def load_strictly(
     with torch.device("meta"):
         network = build()
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    if any(name.startswith(_TRANSFORMERS_PREFIX) for name in tensors):
-        raise WeightsError(
-            f"{origin}: a transformers port of the weights ({_TRANSFORMERS_PREFIX}...); use the official file"
-        )
-    kept = {name: shape for name, shape in (unused or {}).items() if name in tensors}
     found = {name: tuple(value.shape) for name, value in tensors.items()}
-    check_layout(found, {**expected, **kept}, origin)
+    check_layout(found, expected, origin)
     for name in expected:
         if not tensors[name].is_floating_point():
             raise WeightsError(f"{origin}: tensor {name} is {tensors[name].dtype}, not floating point")
