@@ -166,7 +166,7 @@ def test_relative_is_never_taken_for_metric(tiny: Any, cache: Path, tmp_path: Pa
 
 def test_a_model_of_another_range_is_noticed(tiny: Any, cache: Path) -> None:
     in_cache(tiny("outdoor")[0], INDOOR)
-    with pytest.raises(WeightsError, match=r"up to 80 m, but '.*indoor' up to 20 m: it is another model"):
+    with pytest.raises(WeightsError, match=r"up to 80 m, but '.*indoor' was trained up to 20 m"):
         create_depth_model(INDOOR)
 
 

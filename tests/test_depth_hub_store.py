@@ -16,7 +16,7 @@ from slamdepth.depth import hub_store, registry
 from slamdepth.depth.card import ModelCard
 from slamdepth.depth.hub_card import card_of_config
 from slamdepth.depth.hub_input import InputRule, usual_rule
-from slamdepth.depth.hub_models import AUTO, BY_NAME, MODELS
+from slamdepth.depth.hub_models import AUTO, BY_NAME, BY_REPO, MODELS
 from slamdepth.depth.hub_official import check_name
 from slamdepth.depth.metric import with_chosen_model
 from slamdepth.depth.registry import chosen_name, depth_model_names, is_depth_model_name
@@ -190,16 +190,19 @@ def test_sizes_of_models_without_one() -> None:
 
 
 def test_zoedepth_says_its_range_itself() -> None:
-    bins = [{"min_depth": 0.001, "max_depth": 10.0}, {"min_depth": 0.001, "max_depth": 80.0}]
+    bins = [{"min_depth": 0.001, "max_depth": 10.0}]
     config = {"model_type": "zoedepth", "bin_configurations": bins}
+    bounded = {**config, "bin_centers_type": "normed"}
     rule = usual_rule("zoedepth")
     card = card_of_config("zoedepth-nyu-kitti", config, rule, "x", BY_NAME["zoedepth-nyu-kitti"])
-    assert (card.range_m, card.native_focal_px, card.kind) == ((0.001, 80.0), None, DepthKind.METRIC)
+    assert (card.range_m, card.native_focal_px, card.kind) == (None, None, DepthKind.METRIC)
     assert isinstance(card, ModelCard)
-    with pytest.raises(WeightsError, match="another model"):
-        card_of_config("zoedepth-nyu", config, rule, "x", BY_NAME["zoedepth-nyu"])
+    assert card_of_config("mine", bounded, rule, "x").range_m == (0.001, 10.0)
+    kitti = BY_REPO["intel/zoedepth-kitti"]
+    with pytest.raises(WeightsError, match="up to 10 m, but 'x' was trained up to 80 m"):
+        card_of_config("x", bounded, rule, "x", kitti)
     with pytest.raises(WeightsError, match="lacks the range"):
-        card_of_config("mine", {"model_type": "zoedepth"}, rule, "x")
+        card_of_config("mine", {"model_type": "zoedepth", "bin_centers_type": "normed"}, rule, "x")
 
 
 def test_official_files_are_told_apart_by_their_names() -> None:

@@ -105,6 +105,8 @@ def _kind_of(
         if model_type == "tipsv2_dpt":
             return METRIC, (float(config.get("min_depth", 1e-3)), float(config.get("max_depth", 10)))
         if model_type == "zoedepth":
+            if config.get("bin_centers_type", "softplus") != "normed":  # not bounded
+                return METRIC, None
             bins = config["bin_configurations"]
             return METRIC, (
                 min(float(one["min_depth"]) for one in bins),
@@ -119,5 +121,6 @@ def _check_range(range_m: tuple[float, float] | None, known: HubModel, origin: s
     far_m = known.training.far_m
     if range_m is not None and far_m is not None and abs(range_m[1] - far_m) > 0.01 * far_m:
         raise WeightsError(
-            f"{origin}: predicts up to {range_m[1]:g} m, but '{name}' up to {far_m:g} m: it is another model"
+            f"{origin}: its {CONFIG} says depth up to {range_m[1]:g} m, but '{name}' was trained up to "
+            f"{far_m:g} m: another model, or a wrong file"
         )

@@ -143,15 +143,13 @@ def _depth_anything() -> Iterator[HubModel]:
 
 
 def _others() -> Iterator[HubModel]:
-    near = Training("12 sets of relative depth, then NYU Depth v2", (384, 512), 415.0863, 10.0)
+    near = Training("12 sets of relative depth, then NYU Depth v2", (384, 512), 415.0863)
     far = Training("12 sets of relative depth, then KITTI", (384, 768), 598.8941, 80.0)
-    both = Training("12 sets of relative depth, then NYU Depth v2 and KITTI", (384, 512), None, 80.0)
-    for name, training in (
-        ("zoedepth-nyu", near),
-        ("zoedepth-kitti", far),
-        ("zoedepth-nyu-kitti", both),
-    ):
-        yield HubModel(name, f"Intel/{name}", METRIC, "MIT", training, *_pins(name))
+    both = Training("12 sets of relative depth, then NYU Depth v2 and KITTI", (384, 512))
+    # No short names for the models of KITTI alone: the scripts that made their files write a range of 10 m.
+    for repo, training in (("zoedepth-nyu", near), ("zoedepth-kitti", far), ("zoedepth-nyu-kitti", both)):
+        short = None if training is far else repo
+        yield HubModel(short, f"Intel/{repo}", METRIC, "MIT", training, *_pins(repo))
     # Depth Pro predicts depth over the focal length in image widths, so f is 1536 px at a width of 1536.
     many = Training("8 real and 12 synthetic sets", (1536, 1536), 1536.0)
     yield HubModel("depth-pro", "apple/DepthPro-hf", METRIC, "Apple AMLR (research only)", many)
@@ -161,7 +159,8 @@ def _others() -> Iterator[HubModel]:
             short = ("dinov2-dpt" if data == "nyu" else "dinov2-dpt-kitti") if size == "small" else None
             yield HubModel(short, f"facebook/{repo}", METRIC, "Apache-2.0", training, *_pins(repo))
     for data, training in (("nyu", _NYU), ("kitti", _KITTI)):
-        yield HubModel(f"glpn-{data}", f"vinvino02/glpn-{data}", METRIC, "Apache-2.0", training)
+        short = "glpn-nyu" if data == "nyu" else None
+        yield HubModel(short, f"vinvino02/glpn-{data}", METRIC, "Apache-2.0", training)
     for repo, licence, side in (
         ("dpt-large", "Apache-2.0", 384),
         ("dpt-hybrid-midas", "Apache-2.0", 384),
