@@ -248,6 +248,19 @@ def test_pytorch_files_and_divided_ones_are_read_too(tiny: Any, tmp_path: Path) 
         create_depth_model(f"hf:{parts}")
 
 
+@pytest.mark.parametrize("family", ["metric", "dpt"])
+def test_configurations_of_earlier_versions_are_read(family: str, tiny: Any, tmp_path: Path) -> None:
+    folder = copied(tiny(family)[0], tmp_path / family, **STATED)
+    expected = create_depth_model(f"hf:{folder}").predict(frame_of()).values
+    config = json.loads((folder / "config.json").read_text())
+    config.pop("dtype", None)
+    config |= {"torch_dtype": "float32", "transformers_version": "4.41.0", "_commit_hash": None}
+    config |= {"backbone": None, "use_pretrained_backbone": False, "use_timm_backbone": False}
+    (folder / "config.json").unlink()
+    (folder / "config.json").write_text(json.dumps(config))
+    np.testing.assert_array_equal(create_depth_model(f"hf:{folder}").predict(frame_of()).values, expected)
+
+
 def test_broken_folders_are_one_line(tiny: Any, tmp_path: Path) -> None:
     def refused(match: str) -> None:
         with pytest.raises(WeightsError, match=match) as error:

@@ -207,11 +207,10 @@ def build_network(settings: dict[str, Any], tensors: dict[str, torch.Tensor], or
     """
     import transformers
 
-    values = {key: value for key, value in settings.items() if key != "model_type"}
     model_type = str(settings.get("model_type"))
     try:
         with _quietly():
-            config = transformers.AutoConfig.for_model(model_type, **values)
+            config = transformers.CONFIG_MAPPING[model_type].from_dict(settings)
             if model_type == DEPTH_PRO:
                 config.use_fov_model = False  # the camera's own focal length is used
             build = transformers.MODEL_FOR_DEPTH_ESTIMATION_MAPPING[type(config)]
