@@ -41,6 +41,14 @@ def synth_command(
         float | None,
         typer.Option(metavar="M", help="Depth noise at 1 m, growing with the square. Default: 0"),
     ] = None,
+    marker: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FAMILY:SIDE",
+            help="Hang an AprilTag or ArUco marker on a wall of the room, its black square SIDE metres wide: "
+            "tag36h11:0.16.",
+        ),
+    ] = None,
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -60,7 +68,7 @@ def synth_command(
     asked = {
         "frames": frames, "fps": fps, "width": width, "height": height, "scene": scene, "seed": seed,
         "texture": texture, "lighting_variation": lighting_variation, "noise": noise,
-        "motion_blur": motion_blur, "depth_noise": depth_noise,
+        "motion_blur": motion_blur, "depth_noise": depth_noise, "marker": marker,
     }  # fmt: skip
     settings = SynthSettings.from_dict(
         {name: value for name, value in asked.items() if value is not None}, origin="command line"

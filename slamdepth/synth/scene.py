@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slamdepth.fiducial import MarkerSpec
 from slamdepth.synth import furniture, paint, prints
 from slamdepth.synth.furniture import tinted
+from slamdepth.synth.marker import hung_marker
 from slamdepth.synth.shapes import Paint, Surface, box, lathe, quad
 
 ROOM_M = (5.0, 4.0, 2.6)
@@ -37,13 +39,14 @@ class Scene:
     lamps: list[Lamp]
 
 
-def build_scene(seed: int, texture: str) -> Scene:
+def build_scene(seed: int, texture: str, marker: MarkerSpec | None = None) -> Scene:
     """Build the room.
 
     Args:
         seed: varies colours, books, prints and small placements.
         texture: ``"rich"``; ``"low"``, with faint contrast; ``"bare"``, a white model of the large
             furniture, which shows light and shape only.
+        marker: hangs on a wall, whatever the texture; None for none.
     """
     rng = np.random.default_rng([seed, 2])
     surfaces = [
@@ -57,6 +60,8 @@ def build_scene(seed: int, texture: str) -> Scene:
             *furniture.cabinet(rng), *furniture.rug_and_table(rng), *furniture.corners(rng),
         ]  # fmt: skip
     surfaces = with_texture(surfaces, texture)
+    if marker is not None:
+        surfaces.append(hung_marker(marker))  # last, so that the rest looks as without it
     lamps = [
         Lamp((2.5, 2.0, 2.50), (0.22, 0.0, 0.0), (0.0, 0.22, 0.0), (3.0, 2.75, 2.35)),
         Lamp((4.93, 2.0, 1.55), (0.0, 0.65, 0.0), (0.0, 0.0, 0.6), (3.4, 3.7, 4.2)),

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from slamdepth.calibration import CAMERA_FILE
 from slamdepth.errors import ConfigError, OutputError
+from slamdepth.fiducial import MarkerSpec
 from slamdepth.io import replacing, write_camera, write_text, write_tum_trajectory
 from slamdepth.types import Camera, Frame, Trajectory
 from slamdepth.typing import Floats, Floats32
@@ -58,6 +59,22 @@ class SynthSettings(BaseModel):
         le=0.1,
         description="deviation of the depth noise at 1 m, growing with the square (a Kinect: 0.0014)",
     )
+    marker: str | None = Field(
+        None, description="AprilTag or ArUco marker on a wall of the room: FAMILY:SIDE or FAMILY:SIDE:NUMBER"
+    )
+
+    @field_validator("marker")
+    @classmethod
+    def _marker_of_the_room(cls, value: str | None, info: ValidationInfo) -> str | None:
+        if value is None:
+            return None
+        if info.data.get("scene") != "room":
+            raise ValueError("it hangs in the scene 'room' only")
+        try:
+            MarkerSpec.parse(value)
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+        return value
 
     @classmethod
     def from_dict(cls, values: dict[str, Any], origin: str = "settings") -> SynthSettings:
@@ -74,9 +91,8 @@ class SynthSettings(BaseModel):
             if problem["type"] == "extra_forbidden":
                 allowed = ", ".join(sorted(cls.model_fields))
                 raise ConfigError(f"{origin}: unknown setting '{name}'; allowed here: {allowed}") from error
-            raise ConfigError(
-                f"{origin}: setting '{name}': {problem['msg']} (got {problem['input']!r})"
-            ) from error
+            message = str(problem["msg"]).removeprefix("Value error, ")
+            raise ConfigError(f"{origin}: setting '{name}': {message} (got {problem['input']!r})") from error
 
 
 def synth_camera(settings: SynthSettings) -> Camera:
@@ -111,9 +127,13 @@ def make_renderer(settings: SynthSettings) -> Renderer:
     from slamdepth.synth.render import Renderer
     from slamdepth.synth.scene import build_scene
 
-    build = build_aliased_scene if settings.scene == "aliased" else build_scene
+    if settings.scene == "aliased":
+        scene = build_aliased_scene(settings.seed, settings.texture)
+    else:
+        marker = None if settings.marker is None else MarkerSpec.parse(settings.marker)
+        scene = build_scene(settings.seed, settings.texture, marker)
     texel_m = _TEXEL_AT_640_M * max(0.4, 640.0 / settings.width)
-    return Renderer(build(settings.seed, settings.texture), synth_camera(settings), texel_m, settings.seed)
+    return Renderer(scene, synth_camera(settings), texel_m, settings.seed)
 
 
 def render_frame(renderer: Renderer, settings: SynthSettings, index: int) -> tuple[Frame, Floats]:
@@ -189,6 +209,8 @@ def _claim(output: Path, settings: SynthSettings) -> None:
     record = {"scene_version": SCENE_VERSION, **settings.model_dump(mode="json")}
     if settings.scene == "room":
         del record["scene"]  # folders from before there were others go on
+    if settings.marker is None:
+        del record["marker"]
     record_file = output / SETTINGS_FILE
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file; name a folder for the sequence")

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""AprilTag and ArUco markers of known size: how they are named, and where an image shows them."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slamdepth.errors import ConfigError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+FAMILIES = {
+    "tag16h5": "DICT_APRILTAG_16h5",
+    "tag25h9": "DICT_APRILTAG_25h9",
+    "tag36h10": "DICT_APRILTAG_36h10",
+    "tag36h11": "DICT_APRILTAG_36h11",
+    **{
+        f"DICT_{n}X{n}_{count}": f"DICT_{n}X{n}_{count}"
+        for n in (4, 5, 6, 7)
+        for count in (50, 100, 250, 1000)
+    },
+    "DICT_ARUCO_ORIGINAL": "DICT_ARUCO_ORIGINAL",
+    "DICT_ARUCO_MIP_36h12": "DICT_ARUCO_MIP_36h12",
+}
+"""Names of marker families, and those of OpenCV for them."""
+
+_SPEC = re.compile(r"([^:]+):([^:]+)(?::([^:]+))?")
+_LARGEST_M = 100.0
+
+
+@dataclass(frozen=True)
+class MarkerSpec:
+    """Markers of one family and size.
+
+    Attributes:
+        family: one of :data:`FAMILIES`.
+        side_m: side of the black square in metres, without the white margin.
+        id: number of the marker; None takes every one of the family.
+    """
+
+    family: str
+    side_m: float
+    id: int | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> MarkerSpec:
+        """Read ``FAMILY:SIDE`` or ``FAMILY:SIDE:NUMBER``, such as ``tag36h11:0.16``.
+
+        Raises:
+            ConfigError: it is none; says what is wrong and lists the families.
+        """
+        found = _SPEC.fullmatch(text.strip())
+        if found is None:
+            raise ConfigError(
+                f"marker {text!r}: expected FAMILY:SIDE in metres, such as tag36h11:0.16, or "
+                "FAMILY:SIDE:NUMBER"
+            )
+        family, side, number = found.groups()
+        if family not in FAMILIES:
+            raise ConfigError(f"marker {text!r}: unknown family {family!r}; known: {', '.join(FAMILIES)}")
+        try:
+            side_m, chosen = float(side), None if number is None else int(number)
+        except ValueError:
+            raise ConfigError(f"marker {text!r}: side and number must be numbers") from None
+        if not (math.isfinite(side_m) and 0 < side_m <= _LARGEST_M):
+            raise ConfigError(f"marker {text!r}: the side must be between 0 and {_LARGEST_M:g} metres")
+        spec = cls(family, side_m, chosen)
+        count = len(spec.dictionary().bytesList)
+        if chosen is not None and not 0 <= chosen < count:
+            raise ConfigError(f"marker {text!r}: {family} has the numbers 0 to {count - 1}")
+        return spec
+
+    def dictionary(self) -> Any:
+        """OpenCV's dictionary of the family."""
+        import cv2
+
+        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILIES[self.family]))
+
+    def __str__(self) -> str:
+        return self.family if self.id is None else f"{self.family} {self.id}"
+
+
+class MarkerDetector:
+    """Finds the markers of one family in images.
+
+    Args:
+        spec: which markers.
+    """
+
+    def __init__(self, spec: MarkerSpec) -> None:
+        import cv2
+
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        self._spec = spec
+        self._detector = cv2.aruco.ArucoDetector(spec.dictionary(), parameters)
+
+    def find(self, image_rgb: NDArray[np.uint8]) -> dict[int, NDArray[np.float64]]:
+        """Corners ``(4, 2)`` in raw pixels by number of each marker that an ``(H, W, 3)`` image shows once.
+
+        They start at the marker's own top left and go round clockwise.
+        """
+        import cv2
+
+        grey = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
+        corners, numbers, _ = self._detector.detectMarkers(grey)
+        if numbers is None:
+            return {}
+        found: dict[int, list[NDArray[np.float64]]] = {}
+        for number, four in zip(np.ravel(numbers).tolist(), corners, strict=True):
+            found.setdefault(number, []).append(np.asarray(four, dtype=np.float64).reshape(4, 2))
+        wanted = found if self._spec.id is None else {self._spec.id: found.get(self._spec.id, [])}
+        return {number: seen[0] for number, seen in wanted.items() if len(seen) == 1}
