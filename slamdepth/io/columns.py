@@ -67,9 +67,9 @@ TUM_COLUMNS = Columns()
 def stated_unit(comments: Sequence[str]) -> TimeUnit | None:
     """The unit of time that a header such as ``# timestamp [ns] filename`` names; None where none does."""
     for comment in reversed(comments):
-        names = _names(comment)
+        names = column_names(comment)
         if names and _role(names[0][0]) == "time":
-            return _time_unit(*names[0])
+            return time_unit_of(*names[0])
     return None
 
 
@@ -80,7 +80,7 @@ def find_columns(path: Path, headers: Sequence[str], count: int) -> Columns | No
         DatasetError: the header describes poses, but without a quaternion or in an unknown unit.
     """
     for header in reversed(headers):
-        names = _names(header)
+        names = column_names(header)
         roles = [_role(name) for name, _ in names]
         if len(names) != count or "time" not in roles or "px" not in roles:
             continue
@@ -99,13 +99,13 @@ def find_columns(path: Path, headers: Sequence[str], count: int) -> Columns | No
             at["time"],
             tuple(at[f"p{axis}"] for axis in "xyz"),
             tuple(at[f"q{axis}"] for axis in "xyzw"),
-            _time_unit(*names[at["time"]]),
+            time_unit_of(*names[at["time"]]),
             _METRES[unit],
         )
     return None
 
 
-def _names(header: str) -> list[tuple[str, str]]:
+def column_names(header: str) -> list[tuple[str, str]]:
     """Names and units of the columns; the unit is what stands in brackets behind a name."""
     text = header.strip().lstrip("#%/ ").strip()
     without_units = _BRACKETS.sub("", text)
@@ -139,6 +139,6 @@ def _role(name: str) -> str | None:
     return None
 
 
-def _time_unit(name: str, bracket: str) -> TimeUnit | None:
+def time_unit_of(name: str, bracket: str) -> TimeUnit | None:
     stated = bracket.lower() or re.split(r"[_.\-]", name)[-1]
     return next((unit for unit, words in _TIME_UNITS.items() if stated in words), None)
