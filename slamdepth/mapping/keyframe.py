@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +31,8 @@ class Keyframe:
         depth_scale: factor that turned the prediction into metres of the map.
         prediction: handle of the depth prediction as the model gave it, before scaling.
         in_metres: turns the prediction into ``(H, W)`` float32 depth in metres of the map.
+        point_rows: ``(N,)`` row of each keypoint's landmark in ``Reconstruction.points_m``, -1 for none;
+            empty where the odometry has no landmarks.
     """
 
     id: int
@@ -40,6 +42,7 @@ class Keyframe:
     depth_scale: float
     prediction: StoredPrediction
     in_metres: Callable[[DepthPrediction], NDArray[np.float32]]
+    point_rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def load_depth_m(self) -> NDArray[np.float32]:
         """Dense depth ``(H, W)`` float32 in metres of the map, 0 where unknown or rejected.

@@ -65,12 +65,14 @@ class StoredPrediction:
     """Handle of a prediction whose maps are in memory or spilled to a file.
 
     Attributes:
-        kind, is_sensor, gravity, gravity_share: as for :class:`slamdepth.DepthPrediction`; always in memory.
+        kind, is_sensor, gravity, gravity_share, scale_sigma_log: as for :class:`slamdepth.DepthPrediction`;
+            always in memory.
     """
 
     def __init__(self, prediction: DepthPrediction) -> None:
         self.kind, self.is_sensor = prediction.kind, prediction.is_sensor
         self.gravity, self.gravity_share = prediction.gravity, prediction.gravity_share
+        self.scale_sigma_log = prediction.scale_sigma_log
         self._resident: DepthPrediction | None = prediction
         self._values: SpilledArray | None = None
         self._sigma_log: SpilledArray | None = None
@@ -94,6 +96,7 @@ class StoredPrediction:
             is_sensor=self.is_sensor,
             gravity=self.gravity,
             gravity_share=self.gravity_share,
+            scale_sigma_log=self.scale_sigma_log,
         )
 
     def _spill(self, file: SpillFile, frame: StoredFrame) -> None:

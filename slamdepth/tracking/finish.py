@@ -26,6 +26,7 @@ from slamdepth.tracking.map_tracker import MapTracker
 from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.tracking.workers import in_parallel
 from slamdepth.types import RunStatistics
+from slamdepth.typing import Ints
 
 _SEARCHED_AGAIN = 6  # neighbours of each keyframe; twice as many gain nothing measurable
 _PASSES = 3  # after the first adjustment; more than one only while the readout time changes
@@ -95,12 +96,15 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
         scale_votes=final.scale_votes,
     )
     in_time = sorted(map_.keyframes, key=lambda keyframe: keyframe.frame.timestamp_s)
+    seen = map_.seen_by(2)
+    rows = np.full(map_.size + 1, -1)  # the last is that of no landmark
+    rows[seen] = np.arange(len(seen))
     # NumPy and the disk work in other threads while this one refines frames
-    with in_parallel(partial(_final, mapper=integration.mapper), in_time) as making:
+    with in_parallel(partial(_final, mapper=integration.mapper, rows=rows), in_time) as making:
         if config.bundle.final:
             frames.refine(shutter.readout_s)
         keyframes = tuple(replace(made.result(), id=n) for n, made in enumerate(making))
-    points_m = map_.landmarks.position_w[map_.seen_by(2)]
+    points_m = map_.landmarks.position_w[seen]
     found = frames.trajectory()
     trajectory = confirmed(found, points_m, frames.quality)
     kept_s = set(trajectory.timestamps_s.tolist())
@@ -203,7 +207,8 @@ def _scale_vote(map_: Map, keyframe: MapKeyframe) -> float | None:
     return float(np.median(np.log(z[ok]) - predicted[ok]))
 
 
-def _final(keyframe: MapKeyframe, mapper: LocalMapper) -> Keyframe:
+def _final(keyframe: MapKeyframe, mapper: LocalMapper, rows: Ints) -> Keyframe:
+    """The finished keyframe; ``rows`` are those of its landmarks in the points of the result, or -1."""
     stored = keyframe.prediction
     assert stored is not None
     in_metres = as_given
@@ -219,4 +224,5 @@ def _final(keyframe: MapKeyframe, mapper: LocalMapper) -> Keyframe:
         keyframe.scale,
         stored,
         in_metres,
+        rows[keyframe.landmark_ids],
     )
