@@ -17,6 +17,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from slamdepth.errors import ConfigError
+from slamdepth.fiducial import MarkerSpec
 
 
 class _Section(BaseModel):
@@ -125,7 +126,13 @@ class DepthConfig(_Section):
 GROUND_TRUTH = "groundtruth"
 """The value of ``scale.depth`` that takes the scale from a sequence's ground truth."""
 
-_FILES = (("depth", "weights"), ("scale", "depth"), ("features", "weights"), ("features", "matcher"))
+_FILES = (
+    ("depth", "weights"),
+    ("scale", "depth"),
+    ("scale", "imu"),
+    ("features", "weights"),
+    ("features", "matcher"),
+)
 """Settings that may name a file."""
 
 
@@ -146,6 +153,30 @@ class ScaleConfig(_Section):
         None, description="those two times, in seconds of the sequence; null: first and last placed frame"
     )
 
+    marker: tuple[str, ...] = Field(
+        (), description="AprilTag or ArUco markers of known size, each FAMILY:SIDE or FAMILY:SIDE:NUMBER"
+    )
+    imu: str | None = Field(
+        None, min_length=1, description="file with inertial data, for the scale and gravity at the end"
+    )
+
+    @property
+    def is_known(self) -> bool:
+        """Whether anything was given to scale the map by besides its depth."""
+        return bool(self.marker) or any(
+            given is not None for given in (self.camera_height_m, self.baseline_m, self.imu)
+        )
+
+    @field_validator("marker")
+    @classmethod
+    def _known_markers(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for text in value:
+            try:
+                MarkerSpec.parse(text)
+            except ConfigError as error:
+                raise ValueError(str(error)) from error
+        return value
+
     @field_validator("depth", mode="before")
     @classmethod
     def _number_or_name(cls, value: Any) -> Any:
@@ -163,10 +194,10 @@ class ScaleConfig(_Section):
 
     @model_validator(mode="after")
     def _one_scale(self) -> ScaleConfig:
-        known = self.camera_height_m is not None or self.baseline_m is not None
-        if known and self.depth == GROUND_TRUTH:
+        if self.is_known and self.depth == GROUND_TRUTH:
             raise ValueError(
-                "a scale from ground truth and a known size (camera height, baseline) exclude each other"
+                "a scale from ground truth and a known size (camera height, baseline, marker, inertial data) "
+                "exclude each other"
             )
         if self.baseline_between_s is not None:
             if self.baseline_m is None:

@@ -25,7 +25,7 @@ from slamdepth.mapping.codec import Encoded, encode_half_precision, encode_image
 from slamdepth.mapping.keyframe_store import KeyframeStore, StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapping.spill_file import SpillFile
-from slamdepth.pipeline.known_size import rescaled
+from slamdepth.scale.known_size import rescaled
 from slamdepth.tracking import frame_log
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 

@@ -19,7 +19,7 @@ from slamdepth.geometry import invert
 from slamdepth.io import read_tum_trajectory
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline import run
-from slamdepth.pipeline.prediction_scale import NETWORK_SIGMA_LOG, PredictionScale
+from slamdepth.pipeline.prediction_scale import PredictionScale
 from slamdepth.pipeline.scale import scale_of_other, settle_scale
 from slamdepth.report import ScaleSource
 from slamdepth.tracking.tracker import Tracker
@@ -125,7 +125,7 @@ def maps_of(*votes: tuple[float, ...]) -> Reconstruction:
 
 def test_a_known_size_rescales_the_largest_map_only() -> None:
     config = Config.from_dict({"scale": {"baseline_m": 78.0}})
-    before = PredictionScale(ScaleSource.NETWORK, "depth predicted by x", NETWORK_SIGMA_LOG)
+    before = PredictionScale(ScaleSource.NETWORK, "depth predicted by x", None)
     found = maps_of((0.1, -0.1, 0.0), (0.2, -0.2, 0.0, 0.0))
     largest, facts, _ = settle_scale(MadeUpDataset(90), found, before, config)
     assert largest.trajectory.T_world_camera[-1, 0, 3] > 1.9 * 39
@@ -134,14 +134,14 @@ def test_a_known_size_rescales_the_largest_map_only() -> None:
     assert other is found.others[0]
     assert notes == ()
     assert (own.source, own.factor, own.keyframes) == (ScaleSource.NETWORK, 1.0, 4)
-    assert (own.uncertainty_log or 0.0) > NETWORK_SIGMA_LOG
+    assert (own.uncertainty_log, own.interval) == (None, None)
     assert (facts.uncertainty_log or 1.0) < 0.05
     assert "what was given to scale the largest map by says nothing of this one" in own.sentence
 
 
 def test_a_factor_on_predictions_is_in_every_map() -> None:
     scale = DepthScale(1.5, 0.0, ScaleDomain.DEPTH)
-    before = PredictionScale(ScaleSource.VALUE, "x times 1.5", NETWORK_SIGMA_LOG, scale=scale)
+    before = PredictionScale(ScaleSource.VALUE, "x times 1.5", None, scale=scale)
     _, own, _ = scale_of_other(MadeUpDataset(90), maps_of((), (0.1,)).others[0], before, Config())
     assert (own.factor, own.prediction_factor, own.uncertainty_log) == (1.5, 1.5, None)
     assert "largest" not in own.sentence
@@ -157,7 +157,7 @@ def test_the_truths_trajectory_scales_the_largest_map_only() -> None:
     truth[:, :3, 3] *= 3.0
     dataset.ground_truth = Trajectory(found.trajectory.timestamps_s, invert(invert(truth)))
     found = replace(found, trajectory=replace(found.trajectory, T_world_camera=bent))
-    before = PredictionScale(ScaleSource.NETWORK, "x", NETWORK_SIGMA_LOG, wants_trajectory=True)
+    before = PredictionScale(ScaleSource.NETWORK, "x", None, wants_trajectory=True)
     largest, facts, _ = settle_scale(dataset, found, before, Config())
     assert facts.factor == pytest.approx(3.0)
     assert facts.from_ground_truth

@@ -23,22 +23,13 @@ from slamdepth.mapping.floor import find_floor
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.pipeline.known_size import (
-    ScaleEstimate,
-    from_baseline,
-    from_camera_height,
-    from_ground_truth,
-    fused,
-    rescaled,
-)
-from slamdepth.pipeline.prediction_scale import (
-    NETWORK_SIGMA_LOG,
-    check_scale_options,
-    choose_prediction_scale,
-)
+from slamdepth.pipeline.prediction_scale import check_scale_options, choose_prediction_scale
 from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.report import ScaleFacts, ScaleSource
+from slamdepth.scale.camera_height import from_camera_height
+from slamdepth.scale.known_size import from_baseline, from_ground_truth, rescaled
+from slamdepth.scale.votes import robust_spread
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, RunStatistics, Trajectory
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
@@ -79,7 +70,12 @@ def room_depth(T_world_camera: np.ndarray, floor_m: float | None, desk_m: float 
 
 
 def room(
-    floor_m: float | None, desk_m: float | None = None, tilt_rad: float = 0.4, *, is_sensor: bool = True
+    floor_m: float | None,
+    desk_m: float | None = None,
+    tilt_rad: float = 0.4,
+    *,
+    is_sensor: bool = True,
+    scale_sigma_log: float | None = None,
 ) -> tuple[Keyframe, ...]:
     """Keyframes whose world is the first camera, looking down by ``tilt_rad``."""
     keyframes = []
@@ -88,7 +84,9 @@ def room(
         T_level_camera = se3_exp(np.array([0.1 * number, 0.02 * number, 0, -tilt_rad, 0.1 * number, 0]))
         depth_m = room_depth(T_level_camera, floor_m, desk_m)
         frame = StoredFrame(Frame(number, number / 10, np.zeros((240, 320, 3), np.uint8), CAMERA))
-        prediction = StoredPrediction(DepthPrediction(depth_m, DepthKind.METRIC, is_sensor=is_sensor))
+        prediction = StoredPrediction(
+            DepthPrediction(depth_m, DepthKind.METRIC, is_sensor=is_sensor, scale_sigma_log=scale_sigma_log)
+        )
         T = np.linalg.inv(first) @ T_level_camera
         keyframes.append(Keyframe(number, frame, T, np.zeros((0, 2)), 1.0, prediction, as_given))
     return tuple(keyframes)
@@ -122,7 +120,7 @@ def settled(
 @pytest.mark.parametrize("tilt_deg", [5.0, 20.0, 33.0])
 @pytest.mark.parametrize("desk_m", [None, 0.7])
 def test_the_floor_is_found_below_a_tilted_camera(tilt_deg: float, desk_m: float | None) -> None:
-    floor = find_floor(room(1.4, desk_m, math.radians(tilt_deg)), 4.0)
+    floor = find_floor(reconstruction_of(keyframes=room(1.4, desk_m, math.radians(tilt_deg))))
     assert floor is not None
     assert floor.height == pytest.approx(1.4, rel=0.01)
     assert floor.tilt_deg == pytest.approx(tilt_deg, abs=1.0)
@@ -131,30 +129,32 @@ def test_the_floor_is_found_below_a_tilted_camera(tilt_deg: float, desk_m: float
 
 
 def test_no_floor_no_height() -> None:
-    assert find_floor(room(None), 4.0) is None
-    assert find_floor(room(1.4, tilt_rad=math.radians(50)), 4.0) is None
-    assert find_floor((), 4.0) is None
-    with pytest.raises(DatasetError, match="no floor was found below the first camera"):
-        from_camera_height(room(None), 1.4, 4.0)
+    nothing = reconstruction_of(keyframes=room(None))
+    assert find_floor(nothing) is None
+    assert find_floor(reconstruction_of(keyframes=room(1.4, tilt_rad=math.radians(50)))) is None
+    assert find_floor(reconstruction_of()) is None
+    with pytest.raises(DatasetError, match="no floor was found below the camera"):
+        from_camera_height(nothing, 1.4)
 
 
 @pytest.mark.parametrize("tilt_deg", [20.0, 50.0, 70.0])
 def test_known_gravity_finds_the_floor_however_the_camera_is_held(tilt_deg: float) -> None:
     tilt = math.radians(tilt_deg)
     gravity_w = se3_exp(np.array([0, 0, 0, -tilt, 0, 0]))[:3, :3].T @ np.array([0.0, 1.0, 0.0])
-    floor = find_floor(room(1.4, None, tilt), 4.0, gravity_w=gravity_w)
+    made = replace(reconstruction_of(keyframes=room(1.4, None, tilt)), gravity_w=gravity_w)
+    floor = find_floor(made)
     assert floor is not None
     assert floor.height == pytest.approx(1.4, rel=0.01)
     assert floor.tilt_deg < 1.0
 
 
-def test_the_floor_of_a_map_of_another_size_is_as_far_away() -> None:
-    small = rescaled(reconstruction_of(keyframes=room(1.4, 0.7)), 0.5).keyframes
-    found = from_camera_height(small, 1.4, 2.0)
-    assert found.factor == pytest.approx(2.0, rel=0.01)
+@pytest.mark.parametrize("scale", [0.03, 0.5, 20.0])
+def test_the_floor_of_a_map_of_any_size_is_as_far_away(scale: float) -> None:
+    small = rescaled(reconstruction_of(keyframes=room(1.4, 0.7)), scale)
+    found = from_camera_height(small, 1.4)
+    assert found.factor == pytest.approx(1 / scale, rel=0.01)
+    assert found.sigma_log is not None
     assert found.sigma_log < 0.05
-    predicted = from_camera_height(room(1.4, is_sensor=False), 1.4, 4.0)
-    assert predicted.sigma_log > 0.1  # a network errs on floors as a whole
 
 
 # --- baselines and ground truth -----------------------------------------------------------
@@ -217,21 +217,12 @@ def test_rescaling_multiplies_every_length_and_nothing_else() -> None:
     np.testing.assert_allclose(back.points_m, before.points_m)
 
 
-def test_estimates_are_fused_by_inverse_variance_of_the_log() -> None:
-    a = ScaleEstimate(ScaleSource.NETWORK, 1.0, 0.2, "")
-    b = ScaleEstimate(ScaleSource.BASELINE, 2.0, 0.1, "")
-    factor, sigma_log, weights = fused([a, b])
-    assert weights == pytest.approx((0.2, 0.8))
-    assert math.log(factor) == pytest.approx(0.8 * math.log(2))
-    assert sigma_log == pytest.approx(1 / math.sqrt(125))
-    assert fused([b, b])[:2] == pytest.approx((2.0, 0.1 / math.sqrt(2)))
-
-
 def test_without_a_known_size_the_scale_is_the_networks_with_its_uncertainty() -> None:
     made, facts, notes = settled(reconstruction_of())
     assert (facts.source, facts.factor, facts.from_ground_truth) == (ScaleSource.NETWORK, 1.0, False)
-    assert facts.uncertainty_log == pytest.approx(math.hypot(NETWORK_SIGMA_LOG, np.std(VOTES) / math.sqrt(5)))
-    assert facts.spread == pytest.approx(np.std(VOTES))
+    assert (facts.uncertainty_log, facts.interval) == (None, None)
+    assert facts.spread == pytest.approx(robust_spread(np.array(VOTES)))
+    assert "its accuracy is unknown, since the depth model states none" in facts.sentence
     assert (facts.keyframes, notes) == (5, ())
     assert "predicted by net" in facts.sentence
     assert "no sensor measured it" in facts.sentence
@@ -260,8 +251,9 @@ def test_a_known_baseline_dominates_and_the_report_says_how() -> None:
 
 
 def test_a_known_size_that_cannot_be_is_noted() -> None:
-    _, _, notes = settled(reconstruction_of(), baseline_m=30.0)
+    _, facts, notes = settled(reconstruction_of(keyframes=room(1.4, scale_sigma_log=0.2)), baseline_m=30.0)
     assert "differ by a factor of 10" in notes[0]
+    assert [part.weight for part in facts.parts] == [0.0, 1.0]  # what was measured outvotes the network
     _, facts, notes = settled(reconstruction_of(keyframes=room(None)), camera_height_m=1.4)
     assert facts.source is ScaleSource.NETWORK
     assert notes[0].startswith("no scale from the camera height: no floor was found")
@@ -362,4 +354,4 @@ def test_a_file_fitted_to_another_sequence_of_the_same_name_is_not_its_own(tmp_p
     theirs = choose(dataset, model, config_of(depth=str(other)), range(8))
     assert not theirs.from_ground_truth
     assert theirs.how.endswith("fitted to the depth sensor of made-up, another sequence")
-    assert theirs.sigma_log == NETWORK_SIGMA_LOG
+    assert theirs.sigma_log is None

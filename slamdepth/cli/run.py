@@ -52,8 +52,24 @@ def run_command(
             "factor from this sequence's ground truth.",
         ),
     ] = None,
+    marker: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FAMILY:SIDE",
+            help="AprilTag or ArUco markers in the video, their black square SIDE metres wide: "
+            "tag36h11:0.16, or tag36h11:0.16:7 for number 7 alone. May be repeated.",
+        ),
+    ] = None,
+    imu: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Inertial data of the same time, CSV of EuRoC or a phone app: scale and gravity.",
+        ),
+    ] = None,
     camera_height: Annotated[
-        float | None, typer.Option(metavar="M", help="First camera's height over the floor in metres.")
+        float | None,
+        typer.Option(metavar="M", help="Height of the (first) camera over the floor or road in metres."),
     ] = None,
     baseline_m: Annotated[
         float | None,
@@ -125,6 +141,8 @@ def run_command(
 
     Example: slamdepth run rgbd_dataset_freiburg1_rpy --depth sensor --features sift
 
+    Example: slamdepth run walk.mp4 --camera camera.yaml --marker tag36h11:0.16
+
     Ctrl-C finishes the run with the frames it has; a second Ctrl-C aborts it.
     """
     settings = _settings(
@@ -141,6 +159,8 @@ def run_command(
             "depth": {"name": depth, "weights": _text(depth_weights)},
             "scale": {
                 "depth": depth_scale,
+                "marker": marker or None,
+                "imu": _text(imu),
                 "camera_height_m": camera_height,
                 "baseline_m": baseline_m,
                 "baseline_between_s": baseline_between,

@@ -1,198 +1,292 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Height of the first camera over the floor, from the depth of the keyframes.
+"""Height of a camera over the floor or the road.
 
-The floor is a plane below the first camera whose normal is close to gravity, where that is known. Where it
-is not, the first camera is assumed to be upright to within ``MAX_TILT_DEG``. Of several such planes (seats,
-desks, the floor) the lowest is taken that is large and has almost no points below it.
+Level surfaces are looked for from the strongest downwards: what lies below the largest plane is searched
+again until nothing level is left, and the lowest is the floor (desks and seats lie above it). All tolerances
+are relative to the height over the plane, since the scale of the map is what is unknown: a relative error of
+depth is the same relative error of the height over the floor that its ray meets.
+
+A hand-held camera moves over one plane of the world. One on a car, a cart or a robot keeps its height while
+the road bends, and a map of a road drifts in scale. So its height over the landmarks of a few keyframes at a
+time is looked for too, and is taken where no plane of the world explains nearly as many keyframes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.mapping.fusion_depth import View, trusted_depth
-from slamdepth.mapping.keyframe import Keyframe
-from slamdepth.mapping.tsdf import undistorted_depth
-from slamdepth.typing import Floats
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+from slamdepth.mapping.floor_points import FloorPoints, dense_points, landmarks, observations
+from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.typing import Floats, Ints
 
 MAX_TILT_DEG = 35.0
-_KNOWN_TILT_DEG = 20.0  # predicted floors lean, and gravity estimated from images errs by some degrees
+_KNOWN_TILT_DEG = 12.0  # gravity estimated from images errs by some degrees
+_LEVEL_TILT_DEG = 3.0  # of one level surface of a place against another
+_STRONG = 100  # points of a plane that tells what is level
 
-_MAX_KEYFRAMES = 40
-_STEP = 2  # of a view 160 pixels wide
-_NORMAL_TOLERANCE_DEG = 15.0  # a surface of predicted depth is wavy
-_TOLERANCE = 0.02  # of the median distance of points from the first camera
+_TOLERANCE = 0.05  # of the height over the plane
+_LOCAL_TOLERANCE = 0.07  # the same of the points of a few keyframes, which are less well known
+_BENEATH = 3.0  # tolerances
 _TRIALS = 500
-_PLANES = 4
-_MIN_SHARE, _MIN_LEVEL_SHARE = 0.02, 0.1  # of all points, of the level ones, that a floor has at least
-_MIN_POINTS = 200
-_MAX_BENEATH = 0.03  # share of all points that may lie clearly below a floor
-_MIN_HEIGHT = 0.1  # of the median distance: nearer is the camera's support or a hand
+_MAX_SAMPLE = 1000  # points that a trial plane is compared with
+_MIN_POINTS, _MIN_SHARE = 25, 0.01  # on a plane, of all points below the horizon
+_MIN_FLOOR = 0.08  # share of the points below the horizon on a floor; less cannot be told from clutter
+_MAX_BENEATH = (
+    0.08  # share of the points below the horizon that may lie beneath a floor: mirrored, mismatched
+)
+_WELL_SUPPORTED = 0.1  # share of the landmarks below the horizon on a plane that needs no dense depth
+_NEIGHBOURS = 2  # keyframes on either side of one whose own height is looked for
+_MAX_WINDOWS = 40
+_SEES = 12  # points on a plane that a keyframe sees
+_KEPT_HEIGHT = 0.12  # robust deviation of the log of a kept height, with the drift of a map of a road
+_CLEARER = 2.0  # times as many keyframes, for the floor not to be one plane of the world
+_FEWEST = 3  # keyframes
+_STEEP = 0.3  # sine of the angle between a path and the horizon, above which it is not along the ground
 
 
 @dataclass(frozen=True)
 class Floor:
-    """A plane below the first camera: ``normal @ p = height`` for points in the world.
+    """The floor below a camera.
 
     Attributes:
-        normal: ``(3,)`` unit vector along gravity.
-        height: height of the first camera over it, in metres of the map.
-        sigma_log: standard error of the log of the height, from the spread of the heights that single
-            keyframes see.
-        tilt_deg: between the normal and gravity, or the first camera's y axis where that is not known.
+        height: of the first camera over it, in metres of the map.
+        sigma_log: standard error of the log of the height, from the heights that single keyframes see.
+        tilt_deg: between its normal and gravity, or the first camera's y axis where that is not known.
         keyframes: number of keyframes that see it.
-        share: share of all points that lie on it.
+        share: share of the points below the horizon that lie on it.
+        is_mounted: True where all keyframes have this height, each over the ground around it; False where
+            the floor is one plane of the world.
     """
 
-    normal: Floats
     height: float
     sigma_log: float
     tilt_deg: float
     keyframes: int
     share: float
+    is_mounted: bool = False
 
 
 @dataclass(frozen=True)
-class _Upright:
-    """The planes that may be a floor."""
+class _Plane:
+    """``normal @ p = offset``; the unit normal points down."""
 
-    gravity_w: Floats
-    least_cosine: float
-    min_height: float
+    normal: Floats
+    offset: float
 
-    def plane(self, normal: Floats, point: Floats) -> tuple[Floats, float] | None:
-        """Unit normal (along gravity) and height of the plane, None where it cannot be a floor."""
-        length = float(np.linalg.norm(normal))
-        if length < 1e-12:
-            return None
-        cosine = float(normal @ self.gravity_w) / length
-        normal = normal / length * (1.0 if cosine > 0 else -1.0)
-        height = float(normal @ point)
-        return None if abs(cosine) < self.least_cosine or height < self.min_height else (normal, height)
+    def heights(self, centres: Floats) -> Floats:
+        """Height ``(N,)`` of cameras ``(N, 3)`` over it."""
+        return np.asarray(self.offset - centres @ self.normal)
+
+    def beyond(self, points: FloorPoints) -> Floats:
+        """How far each point ``(N,)`` lies beneath it, over its camera's height; infinite below it."""
+        height = self.heights(points.centre)
+        beneath = points.points @ self.normal - self.offset
+        return np.where(height > 0, beneath / np.maximum(height, 1e-12), np.inf)
 
 
-def find_floor(
-    keyframes: Sequence[Keyframe], max_depth_m: float, *, gravity_w: Floats | None = None, seed: int = 0
-) -> Floor | None:
-    """The floor below the first camera, or None where no large level surface is found there.
+def find_floor(reconstruction: Reconstruction, *, seed: int = 0) -> Floor | None:
+    """The floor below the first camera, or None where nothing level is found there.
 
     Args:
-        keyframes: in order of time; the world is the first camera.
-        max_depth_m: depth beyond is not used.
-        gravity_w: unit direction of gravity ``(3,)`` in the world; None where it is not known.
+        reconstruction: a finished map; its gravity is used where it is known.
         seed: of the random trials (RANSAC).
     """
-    max_tilt_deg = MAX_TILT_DEG if gravity_w is None else _KNOWN_TILT_DEG
-    gravity_w = np.array([0.0, 1.0, 0.0]) if gravity_w is None else gravity_w
-    chosen = np.unique(np.linspace(0, len(keyframes) - 1, min(len(keyframes), _MAX_KEYFRAMES)).astype(int))
-    clouds = [_points_and_normals(keyframes[i], max_depth_m) for i in chosen]
-    if not clouds or not (total := sum(len(points) for points, _ in clouds)):
+    if not reconstruction.keyframes:
         return None
-    points = np.concatenate([points for points, _ in clouds])
-    normals = np.concatenate([normals for _, normals in clouds])
-    owner = np.repeat(np.arange(len(clouds)), [len(points) for points, _ in clouds])
-    scale = float(np.median(np.linalg.norm(points, axis=1)))
-    tolerance = _TOLERANCE * scale
-    level = np.abs(normals @ gravity_w) > math.cos(math.radians(max_tilt_deg + _NORMAL_TOLERANCE_DEG))
-    upright = _Upright(gravity_w, math.cos(math.radians(max_tilt_deg)), _MIN_HEIGHT * scale)
+    gravity_w, max_tilt_deg = reconstruction.gravity_w, _KNOWN_TILT_DEG
+    if gravity_w is None:
+        first = reconstruction.keyframes[0].T_world_camera
+        gravity_w, max_tilt_deg = first[:3, :3] @ np.array([0.0, 1.0, 0.0]), MAX_TILT_DEG
     rng = np.random.default_rng(seed)
-    left = level.copy()
-    best: tuple[float, Floats, NDArray[np.bool_]] | None = None
-    for _ in range(_PLANES):
-        found = _plane(points[left], normals[left], tolerance, upright, rng)
-        if found is None:
-            break
-        normal, height = found
-        on_plane = level & _lies_on(points, normals, normal, height, tolerance)
-        left &= ~on_plane
-        least = max(_MIN_POINTS, _MIN_SHARE * total, _MIN_LEVEL_SHARE * np.count_nonzero(level))
-        if np.count_nonzero(on_plane) < least:
-            continue
-        beneath = np.mean(points @ normal > height + 4 * tolerance)
-        if beneath <= _MAX_BENEATH and (best is None or height > best[0]):
-            best = height, normal, on_plane
-    if best is None:
+    rows, owner = observations(reconstruction)
+    sparse = landmarks(reconstruction, rows, owner).below(gravity_w)
+    of_world = _one_plane(sparse, gravity_w, max_tilt_deg, rng)
+    if of_world is None or of_world.share < _WELL_SUPPORTED:
+        dense = dense_points(reconstruction, rows, owner, gravity_w, max_tilt_deg)
+        if dense is not None:
+            both = sparse.joined(dense.below(gravity_w))
+            of_world = _one_plane(both, gravity_w, max_tilt_deg, rng)
+    mounted = _mounted(reconstruction, rows, owner, gravity_w)
+    if of_world is None or mounted is None:
+        return of_world or mounted
+    return mounted if mounted.keyframes > _CLEARER * of_world.keyframes else of_world
+
+
+def _one_plane(
+    points: FloorPoints, gravity_w: Floats, max_tilt_deg: float, rng: np.random.Generator
+) -> Floor | None:
+    """The floor as one plane of the world."""
+    plane = lowest_level(points, gravity_w, max_tilt_deg, rng)
+    if plane is None:
         return None
-    height, normal, on_plane = best
-    heights = [
-        float(np.median(points[mine] @ normal))
-        for k in range(len(clouds))
-        if np.count_nonzero(mine := on_plane & (owner == k)) >= _MIN_POINTS // 4
-    ]
-    # at least the tolerance: the heights of few keyframes may agree by chance
-    spread = max(float(np.std(heights)) if len(heights) > 1 else 0.0, tolerance)
+    on_plane = np.abs(plane.beyond(points)) < _TOLERANCE
+    heights = []
+    for number in np.unique(points.owner[on_plane]):
+        mine = on_plane & (points.owner == number)
+        if np.count_nonzero(mine) >= _SEES:
+            heights.append(float(np.median(points.points[mine] @ plane.normal)))
+    first = float(plane.heights(points.centres[:1])[0])
+    if len(heights) < _FEWEST or first <= 0:
+        return None
+    share = float(np.mean(on_plane))
+    if share < _MIN_FLOOR:
+        return None
+    spread = float(np.std(heights)) / first / math.sqrt(len(heights))
     return Floor(
-        normal=normal,
-        height=height,
-        sigma_log=spread / height / math.sqrt(max(1, len(heights))),
-        tilt_deg=math.degrees(math.acos(min(1.0, float(normal @ gravity_w)))),
+        height=first,
+        sigma_log=math.hypot(spread, _TOLERANCE / 2),  # what lies on it is told to the tolerance
+        tilt_deg=_angle_deg(plane.normal, gravity_w),
         keyframes=len(heights),
-        share=float(np.mean(on_plane)),
+        share=share,
     )
 
 
-def _points_and_normals(keyframe: Keyframe, max_depth_m: float) -> tuple[Floats, Floats]:
-    """Surface points ``(N, 3)`` in the world and their unit normals, of either sign."""
-    camera = keyframe.frame.camera
-    depth_m = undistorted_depth(trusted_depth(keyframe, max_depth_m), camera)
-    view = View.of(depth_m, camera.without_distortion(), keyframe.T_world_camera)
-    inside = view.depth_m[_STEP:-_STEP, _STEP:-_STEP] > 0
-    grid = np.full((*view.depth_m.shape, 3), np.nan)
-    points, index = view.points_world()
-    grid.reshape(-1, 3)[index] = points
-    across = grid[_STEP:-_STEP, 2 * _STEP :] - grid[_STEP:-_STEP, : -2 * _STEP]
-    down = grid[2 * _STEP :, _STEP:-_STEP] - grid[: -2 * _STEP, _STEP:-_STEP]
-    normals = np.cross(across, down)
-    length = np.linalg.norm(normals, axis=2)
-    keep = inside & (length > 0)  # False for NaN
-    keep[1::2] = False
-    keep[:, 1::2] = False
-    return grid[_STEP:-_STEP, _STEP:-_STEP][keep], normals[keep] / length[keep][:, None]
+def _mounted(reconstruction: Reconstruction, rows: Ints, owner: Ints, gravity_w: Floats) -> Floor | None:
+    """The ground below a camera that keeps its height and moves parallel to the ground.
+
+    Gravity and the direction of motion say what is level at each keyframe, so that only the height over the
+    landmarks of a few keyframes is left: where the logs of the heights are densest.
+    """
+    keyframes = reconstruction.keyframes
+    centres = np.array([keyframe.T_world_camera[:3, 3] for keyframe in keyframes])
+    count = len(keyframes)
+    windows = np.unique(np.linspace(0, count - 1, min(count, _MAX_WINDOWS)).astype(int))
+    found = []
+    for number in windows:
+        near = np.abs(owner - number) <= _NEIGHBOURS
+        first, last = max(0, number - _NEIGHBOURS), min(count - 1, number + _NEIGHBOURS)
+        path = centres[last] - centres[first]
+        normal = _across(gravity_w, path)
+        if normal is None:
+            continue
+        some = landmarks(reconstruction, rows[near], owner[near])
+        # every point as this keyframe sees it: the road is level around it, not elsewhere
+        points = FloorPoints(some.points, np.full(len(some), number), some.centres).below(normal)
+        height = _densest((points.points - centres[number]) @ normal)
+        if height is not None and np.linalg.norm(path) > height:
+            share = float(
+                np.mean(np.abs((points.points - centres[number]) @ normal / height - 1) < _TOLERANCE)
+            )
+            found.append((height, _angle_deg(normal, gravity_w), share))
+    if len(found) < max(_FEWEST, len(windows) / 2):
+        return None
+    heights, tilts, shares = np.array(found).T
+    centre = float(np.median(np.log(heights)))
+    spread = 1.4826 * float(np.median(np.abs(np.log(heights) - centre)))
+    if spread > _KEPT_HEIGHT:
+        return None
+    independent = len(found) / len(windows) * count / (2 * _NEIGHBOURS + 1)  # neighbours share their points
+    return Floor(
+        height=math.exp(centre),
+        sigma_log=math.hypot(spread / math.sqrt(max(1.0, independent)), _TOLERANCE / 2),
+        tilt_deg=float(np.median(tilts)),
+        keyframes=round(len(found) / len(windows) * count),
+        share=float(np.median(shares)),
+        is_mounted=True,
+    )
+
+
+def _across(gravity_w: Floats, path: Floats) -> Floats | None:
+    """The unit direction across ``path (3,)`` that is nearest to gravity; None where the path is steep."""
+    length = float(np.linalg.norm(path))
+    if length < 1e-12 or abs(float(gravity_w @ path)) > _STEEP * length:
+        return None
+    across = gravity_w - (gravity_w @ path) / length**2 * path
+    return np.asarray(across / np.linalg.norm(across))
+
+
+def _densest(heights: Floats) -> float | None:
+    """The height ``(N,)`` that most others equal to the tolerance, where little lies beneath it."""
+    if len(heights) < _MIN_POINTS:
+        return None
+    logs = np.sort(np.log(heights))
+    low, high = (np.searchsorted(logs, logs + side * _LOCAL_TOLERANCE) for side in (-1, 1))
+    best = int(np.argmax(high - low))
+    beneath = np.mean(logs > logs[best] + _BENEATH * _LOCAL_TOLERANCE)
+    return None if beneath > _MAX_BENEATH else math.exp(float(np.median(logs[low[best] : high[best]])))
+
+
+def lowest_level(
+    points: FloorPoints,
+    gravity_w: Floats,
+    max_tilt_deg: float,
+    rng: np.random.Generator,
+) -> _Plane | None:
+    """The lowest level plane of points below the horizon.
+
+    Args:
+        gravity_w: ``(3,)`` unit direction.
+        max_tilt_deg: of the strongest plane against it; lower ones are nearly parallel to that one.
+    """
+    pool = np.ones(len(points), dtype=np.bool_)
+    found: _Plane | None = None
+    least = max(_MIN_POINTS, _MIN_SHARE * len(points))
+    while np.count_nonzero(pool) >= least:
+        plane = _plane(points.of(pool), points, gravity_w, max_tilt_deg, rng)
+        if plane is None:
+            break
+        beyond = plane.beyond(points)
+        count = int(np.count_nonzero(np.abs(beyond) < _TOLERANCE))
+        beneath = beyond > _BENEATH * _TOLERANCE
+        if count < least or np.count_nonzero(beneath) >= np.count_nonzero(pool):
+            break
+        if found is None and count >= _STRONG:
+            gravity_w, max_tilt_deg = plane.normal, _LEVEL_TILT_DEG
+        found, pool = plane, beneath
+    if found is None or np.count_nonzero(pool) > _MAX_BENEATH * len(points):
+        return None
+    return found
 
 
 def _plane(
-    points: Floats, normals: Floats, tolerance: float, upright: _Upright, rng: np.random.Generator
-) -> tuple[Floats, float] | None:
-    """The level plane below the world's origin that most points lie on (RANSAC, then least squares)."""
-    if len(points) < _MIN_POINTS:
+    some: FloorPoints,
+    points: FloorPoints,
+    gravity_w: Floats,
+    max_tilt_deg: float,
+    rng: np.random.Generator,
+) -> _Plane | None:
+    """The plane that most of ``some`` points lie on (RANSAC), fitted to all ``points`` on it."""
+    least_cosine = math.cos(math.radians(max_tilt_deg))
+    thin = some
+    if len(some) > _MAX_SAMPLE:
+        chosen = np.zeros(len(some), dtype=np.bool_)
+        chosen[rng.choice(len(some), _MAX_SAMPLE, replace=False)] = True
+        thin = some.of(chosen)
+    a, b, c = (thin.points[rng.integers(0, len(thin), _TRIALS)] for _ in range(3))
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    normals *= (np.sign(normals @ gravity_w) / np.maximum(length, 1e-12))[:, None]
+    keep = (length > 1e-12) & (normals @ gravity_w >= least_cosine)
+    normals, offsets = normals[keep], np.sum(normals[keep] * a[keep], axis=1)
+    if not len(normals):
         return None
-    thin = slice(None, None, max(1, len(points) // 3000))
-    some, some_normals = points[thin], normals[thin]
-    best, most = None, 0
-    for three in rng.integers(0, len(some), (_TRIALS, 3)):
-        a, b, c = some[three]
-        found = upright.plane(np.cross(b - a, c - a), a)
-        if found is None:
-            continue
-        count = int(np.count_nonzero(_lies_on(some, some_normals, *found, tolerance)))
-        if count > most:
-            best, most = found, count
-    if best is None:
-        return None
-    for _ in range(5):
-        mine = points[_lies_on(points, normals, *best, tolerance)]
-        if len(mine) < 3:
-            return None
-        centre = mine.mean(axis=0)
-        axes = np.linalg.svd(mine - centre, full_matrices=False)[2]
-        better = upright.plane(axes[2], centre)
-        if better is None:
-            return None
-        best = better
-    return best
+    height = offsets[:, None] - normals @ thin.centre.T
+    beyond = normals @ thin.points.T - offsets[:, None]
+    count = np.count_nonzero((np.abs(beyond) < _TOLERANCE * height) & (height > 0), axis=1)
+    best = int(np.argmax(count))
+    return _fitted(_Plane(normals[best], float(offsets[best])), points, gravity_w, least_cosine)
 
 
-def _lies_on(
-    points: Floats, normals: Floats, normal: Floats, height: float, tolerance: float
-) -> NDArray[np.bool_]:
-    near = np.abs(points @ normal - height) < tolerance
-    return near & (np.abs(normals @ normal) > math.cos(math.radians(2 * _NORMAL_TOLERANCE_DEG)))
+def _fitted(plane: _Plane, points: FloorPoints, gravity_w: Floats, least_cosine: float) -> _Plane:
+    """Least squares of relative distances with Tukey's weights; ``plane`` where the result is not level."""
+    for _ in range(10):
+        beyond = plane.beyond(points)
+        mine = np.abs(beyond) < _TOLERANCE
+        if np.count_nonzero(mine) < 3:
+            return plane
+        weight = (1.0 - (beyond[mine] / _TOLERANCE) ** 2) ** 2 / plane.heights(points.centre[mine]) ** 2
+        on_plane = points.points[mine]
+        centre = weight @ on_plane / weight.sum()
+        axes = np.linalg.svd((on_plane - centre) * np.sqrt(weight)[:, None], full_matrices=False)[2]
+        normal = axes[2] * (1.0 if axes[2] @ gravity_w > 0 else -1.0)
+        if normal @ gravity_w < least_cosine:
+            return plane
+        plane = _Plane(normal, float(normal @ centre))
+    return plane
+
+
+def _angle_deg(a: Floats, b: Floats) -> float:
+    return math.degrees(math.acos(min(1.0, float(a @ b))))

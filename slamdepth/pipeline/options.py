@@ -66,6 +66,7 @@ class RunStage(str, Enum):
     SCALING = "fitting the scale"
     TRACKING = "tracking"
     OPTIMISING = "optimising"
+    MARKERS = "looking for markers"
     MESHING = "meshing"
     SCORING = "scoring"
 
@@ -76,7 +77,7 @@ class RunProgress:
 
     Attributes:
         stage: what the run is doing.
-        done, total: frames while tracking and fitting, keyframes while meshing.
+        done, total: frames while tracking, fitting and looking for markers, keyframes while meshing.
         fps: frames per second so far.
         status: of the last frame, None before the first.
         keyframes, loop_closures: totals so far.

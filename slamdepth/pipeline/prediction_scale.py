@@ -21,18 +21,14 @@ from slamdepth.depth.scale import DepthScale, ScaleDomain, ScaleFit, fit_scale, 
 from slamdepth.depth.scale_file import check_same_model, read_scale
 from slamdepth.depth.scaled import ScaledDepth
 from slamdepth.errors import ConfigError, DatasetError, ImageDecodeError
-from slamdepth.pipeline.known_size import SENSOR_SIGMA_LOG
+from slamdepth.io.imu import read_imu
 from slamdepth.pipeline.options import RunInterrupted
 from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.report import ScaleSource
+from slamdepth.scale.known_size import SENSOR_SIGMA_LOG
 from slamdepth.types import Frame
 
 logger = logging.getLogger(__name__)
-
-NETWORK_SIGMA_LOG = 0.2
-"""Assumed standard deviation of the log of a network's scale, common to all frames of a place. The shipped
-head was off by 0.10 to 0.17 on three real sequences it had not seen (README), by more on some held-out
-places."""
 
 MAP_SIGMA_LOG = 0.12
 """Assumed standard deviation of the log ratio of a map's scale and that of all pixels of its predictions:
@@ -48,7 +44,8 @@ class PredictionScale:
     Attributes:
         source: where the scale comes from; NETWORK or SENSOR where predictions stay as they are.
         how: the same as a phrase.
-        sigma_log: assumed standard deviation of the log of the resulting scale of the map.
+        sigma_log: standard deviation of the log of the resulting scale of the map; None where only the depth
+            model can say.
         scale: what is applied to predictions, or None.
         from_ground_truth: True where the scale comes from this sequence's own sensor.
         fit: the fit, where this run made one.
@@ -57,7 +54,7 @@ class PredictionScale:
 
     source: ScaleSource
     how: str
-    sigma_log: float
+    sigma_log: float | None
     scale: DepthScale | None = None
     from_ground_truth: bool = False
     fit: ScaleFit | None = None
@@ -82,9 +79,11 @@ def check_scale_options(dataset: Dataset, config: Config, indices: Sequence[int]
 
     Raises:
         ConfigError: the times of a baseline lie outside the frames.
-        DatasetError: there is no ground truth to take a scale from.
+        DatasetError: there is no ground truth to take a scale from, or the inertial data cannot be read.
     """
     scale = config.scale
+    if scale.imu is not None:
+        read_imu(scale.imu)
     if scale.depth == GROUND_TRUTH and not dataset.has_depth and dataset.ground_truth is None:
         raise DatasetError(
             f"{dataset.path}: has neither depth images nor a ground truth trajectory to take the scale from"
@@ -127,11 +126,11 @@ def choose_prediction_scale(
             raise ConfigError(f"--depth {name} is in metres already; --depth-scale is for predicted depth")
         return PredictionScale(ScaleSource.SENSOR, "measured by the depth sensor", SENSOR_SIGMA_LOG)
     if asked is None:
-        return PredictionScale(ScaleSource.NETWORK, f"depth predicted by {name}", NETWORK_SIGMA_LOG)
+        return PredictionScale(ScaleSource.NETWORK, f"depth predicted by {name}", None)
     if asked == GROUND_TRUTH:
         if not dataset.has_depth:
             how = f"depth predicted by {name}"
-            return PredictionScale(ScaleSource.NETWORK, how, NETWORK_SIGMA_LOG, wants_trajectory=True)
+            return PredictionScale(ScaleSource.NETWORK, how, None, wants_trajectory=True)
         chosen = indices[:: -(-len(indices) // _FIT_FRAMES)]
         frames = read_with_depth(dataset, chosen, progress, stop)
         fit = fit_scale(
@@ -148,7 +147,7 @@ def choose_prediction_scale(
     if isinstance(asked, float | int):
         scale = DepthScale(float(asked), 0.0, ScaleDomain.of(model.kind))
         how = f"{_formula(name, scale)}, a number given by the user"
-        return PredictionScale(ScaleSource.VALUE, how, NETWORK_SIGMA_LOG, scale=scale)
+        return PredictionScale(ScaleSource.VALUE, how, None, scale=scale)
     fit = read_scale(asked)
     check_same_model(fit, model, asked)
     is_own = fit.sequence_id == sequence_id(dataset)
@@ -158,7 +157,7 @@ def choose_prediction_scale(
 
 
 def _of_fit(source: ScaleSource, fit: ScaleFit, how: str, *, own: bool) -> PredictionScale:
-    sigma_log = NETWORK_SIGMA_LOG
+    sigma_log = None
     if own and fit.scale_sigma_log is not None:
         sigma_log = math.hypot(fit.scale_sigma_log, MAP_SIGMA_LOG)
     return PredictionScale(

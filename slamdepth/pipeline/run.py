@@ -209,7 +209,9 @@ def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threadin
 def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     """Everything after tracking; the trajectory first, since it is what was asked for."""
     config, dataset, folder, scale = job.config, job.dataset, job.folder, job.scale
-    reconstruction, scale_facts, scale_notes = settle_scale(dataset, tracked.reconstruction, scale, config)
+    reconstruction, scale_facts, scale_notes = settle_scale(
+        dataset, tracked.reconstruction, scale, config, tell
+    )
     others, other_notes = settle_others(dataset, tracked.reconstruction, scale, config)
     reconstruction = replace(reconstruction, others=tuple(one.reconstruction for one in others))
     write_trajectories(folder, (reconstruction, *reconstruction.others))

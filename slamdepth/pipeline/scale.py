@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""After tracking: the final scale of each map, and one sentence about it.
+"""After tracking: the final scale of each map.
 
-The largest map may be rescaled: by known sizes, combined with the scale that the depth gave the map, or,
-where that is asked for, by the scale of the ground truth's trajectory. Maps that never met it have no part
-in these: their scale is what their own depth gave them.
+The largest map may be rescaled: by what was given to scale it by (a known size, a marker, inertial data),
+combined with the scale that the depth gave the map, or, where that is asked for, by the scale of the ground
+truth's trajectory. Maps that never met it have no part in these: their scale is what their own depth gave
+them.
 """
 
 from __future__ import annotations
@@ -11,52 +12,64 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-
-import numpy as np
+from dataclasses import dataclass, replace
+from functools import partial
 
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset
 from slamdepth.errors import DatasetError
+from slamdepth.fiducial import MarkerSpec
+from slamdepth.io.imu import read_imu
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.pipeline.known_size import (
-    ScaleEstimate,
-    from_baseline,
-    from_camera_height,
-    from_ground_truth,
-    from_sensor,
-    fused,
-    rescaled,
-)
+from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
 from slamdepth.pipeline.prediction_scale import PredictionScale, read_with_depth
+from slamdepth.pipeline.scale_sentence import (
+    NO_CLAIM,
+    disagreements,
+    fused_sentence,
+    measured_sentence,
+    multiplied_sentence,
+    own_sentence,
+)
 from slamdepth.report import ScaleFacts, ScalePart, ScaleSource
+from slamdepth.scale.camera_height import from_camera_height
+from slamdepth.scale.estimate import Fused, ScaleEstimate, fused
+from slamdepth.scale.imu import from_imu
+from slamdepth.scale.known_size import from_baseline, from_ground_truth, from_sensor, rescaled
+from slamdepth.scale.marker import from_markers
+from slamdepth.scale.votes import VotedScale, judge_votes
 
 logger = logging.getLogger(__name__)
 
-_NO_CLAIM = "the scale was taken from ground truth: SE(3) ATE is not a metric claim"
-
 
 def settle_scale(
-    dataset: Dataset, reconstruction: Reconstruction, before: PredictionScale, config: Config
+    dataset: Dataset,
+    reconstruction: Reconstruction,
+    before: PredictionScale,
+    config: Config,
+    tell: ProgressCallback = lambda state: None,
 ) -> tuple[Reconstruction, ScaleFacts, tuple[str, ...]]:
     """Settle the scale of the largest map; ``others`` stay as they are.
 
     Args:
         reconstruction: as the tracker returned it.
         before: what was applied to the predictions it was made of.
+        tell: progress, while images are searched for markers.
 
     Returns:
         The reconstruction at its final scale, the facts about that scale, and notes on what failed.
     """
-    own, own_sentence, own_notes = _own_scale(dataset, reconstruction, before, _spread(reconstruction))
-    known, notes = _known_sizes(dataset, reconstruction, before, config)
-    notes += own_notes
-    verdict = _verdict(before, own, own_sentence, known)
-    claim = [_NO_CLAIM] if verdict.from_ground_truth else []
+    own = _own_scale(dataset, reconstruction, before)
+    reconstruction, known, notes = _with_inertial_gravity(reconstruction, config)
+    sizes, further = _known_scales(dataset, reconstruction, before, config, tell)
+    known += sizes
+    notes += further + own.notes
+    verdict = _verdict(before, own, known)
+    claim = [NO_CLAIM] if verdict.from_ground_truth else []
     sentence = "; ".join([verdict.sentence, *notes, *claim])
     if known and not before.wants_trajectory:
-        notes += _disagreements(own, known)
-    facts = _facts(reconstruction, before, verdict, sentence, is_known=bool(known))
+        notes += disagreements(own.estimate, known, verdict.fused)
+    facts = _facts(before, own.voted, verdict, sentence)
     logger.info("scale: %s", sentence)
     for note in notes:
         logger.warning("%s", note)
@@ -70,8 +83,7 @@ def scale_of_other(
 ) -> tuple[Reconstruction, ScaleFacts, tuple[str, ...]]:
     """Settle the scale of a map that never met the largest one, by its own depth alone.
 
-    A factor on predictions is in its depth already. A known size and the ground truth's trajectory belong to
-    the largest map.
+    A factor on predictions is in its depth already. What scales the largest map says nothing of this one.
 
     Args:
         other: as the tracker returned it.
@@ -80,49 +92,24 @@ def scale_of_other(
     Returns:
         The map at its final scale, the facts about that scale, and notes on what failed.
     """
-    own, sentence, notes = _own_scale(dataset, other, before, _spread(other))
-    asked = (config.scale.camera_height_m, config.scale.baseline_m)
-    if before.wants_trajectory or any(length_m is not None for length_m in asked):
+    own = _own_scale(dataset, other, before)
+    sentence = own.sentence
+    if before.wants_trajectory or config.scale.is_known:
         sentence += "; what was given to scale the largest map by says nothing of this one"
-    facts = _facts(other, before, _Verdict(own, sentence, before.from_ground_truth), sentence, is_known=False)
-    return rescaled(other, own.factor) if own.factor != 1.0 else other, facts, tuple(notes)
+    verdict = _Verdict(own.estimate, sentence, before.from_ground_truth)
+    facts = _facts(before, own.voted, verdict, sentence)
+    factor = own.estimate.factor
+    return rescaled(other, factor) if factor != 1.0 else other, facts, tuple(own.notes)
 
 
-def _spread(reconstruction: Reconstruction) -> float | None:
-    """Standard deviation of the keyframes' votes, None without votes."""
-    votes = reconstruction.statistics.scale_votes
-    return float(np.std(votes)) if votes else None
+@dataclass(frozen=True)
+class _Own:
+    """The scale that the depth gave a map."""
 
-
-def _facts(
-    reconstruction: Reconstruction,
-    before: PredictionScale,
-    verdict: _Verdict,
-    sentence: str,
-    *,
-    is_known: bool,
-) -> ScaleFacts:
-    """What the report says of the scale.
-
-    Args:
-        reconstruction: before it was rescaled.
-        is_known: a known size or the ground truth's trajectory took part.
-    """
-    shifted = before.scale if before.scale is not None and before.scale.shift else None
-    is_unknown = before.source is ScaleSource.VALUE and not is_known
-    return ScaleFacts(
-        source=verdict.estimate.source,
-        factor=before.prediction_factor * verdict.estimate.factor,
-        sentence=sentence,
-        uncertainty_log=None if is_unknown else verdict.estimate.sigma_log,
-        keyframes=len(reconstruction.statistics.scale_votes),
-        spread=_spread(reconstruction),
-        prediction_factor=before.prediction_factor,
-        shift=None if shifted is None else shifted.shift,
-        shift_unit=None if shifted is None else shifted.domain.shift_unit,
-        from_ground_truth=verdict.from_ground_truth,
-        parts=verdict.parts,
-    )
+    estimate: ScaleEstimate
+    voted: VotedScale
+    sentence: str
+    notes: list[str]
 
 
 @dataclass(frozen=True)
@@ -133,132 +120,121 @@ class _Verdict:
     sentence: str
     from_ground_truth: bool
     parts: tuple[ScalePart, ...] = ()
+    fused: Fused | None = None
 
 
-def _own_scale(
-    dataset: Dataset, reconstruction: Reconstruction, before: PredictionScale, spread: float | None
-) -> tuple[ScaleEstimate, str, list[str]]:
-    """The scale that the depth gave the map, a sentence about it, and notes.
+def _facts(before: PredictionScale, voted: VotedScale, verdict: _Verdict, sentence: str) -> ScaleFacts:
+    """What the report says of the scale."""
+    shifted = before.scale if before.scale is not None and before.scale.shift else None
+    estimate = verdict.estimate
+    return ScaleFacts(
+        source=estimate.source,
+        factor=before.prediction_factor * estimate.factor,
+        sentence=sentence,
+        uncertainty_log=estimate.sigma_log if estimate.is_stated else None,
+        keyframes=voted.votes,
+        independent=voted.independent if voted.votes else None,
+        spread=voted.spread,
+        prediction_factor=before.prediction_factor,
+        shift=None if shifted is None else shifted.shift,
+        shift_unit=None if shifted is None else shifted.domain.shift_unit,
+        from_ground_truth=verdict.from_ground_truth,
+        parts=verdict.parts,
+    )
+
+
+def _own_scale(dataset: Dataset, reconstruction: Reconstruction, before: PredictionScale) -> _Own:
+    """The scale that the depth gave the map.
 
     Where this run fitted the scale to the sensor, the finished map is compared with the sensor once more.
-
-    Args:
-        spread: standard deviation of the keyframes' votes, None without votes.
     """
-    votes = len(reconstruction.statistics.scale_votes)
+    voted = judge_votes(reconstruction)
     notes: list[str] = []
     if before.fit is not None:
         keyframes = reconstruction.keyframes
         frames = read_with_depth(dataset, [k.frame.index for k in keyframes], lambda done, total: None)
         try:
             measured = from_sensor(keyframes, frames)
-            return measured, _measured_sentence(before, measured), notes
+            return _Own(measured, voted, measured_sentence(before, measured), notes)
         except DatasetError as error:
             notes.append(f"the map's own scale was not compared with the sensor: {error}")
-    sigma_log = before.sigma_log
-    if spread is not None:
-        sigma_log = math.hypot(sigma_log, spread / math.sqrt(votes))
+    sigma_log = voted.sigma_log
+    if before.source is ScaleSource.VALUE:
+        sigma_log = None
+    elif before.sigma_log is not None:
+        sigma_log = before.sigma_log
+        if voted.spread is not None:
+            sigma_log = math.hypot(sigma_log, voted.spread / math.sqrt(voted.independent))
     own = ScaleEstimate(before.source, 1.0, sigma_log, before.how)
-    return own, _own_sentence(before, votes, spread, sigma_log), notes
+    return _Own(own, voted, own_sentence(own, voted), notes)
 
 
-def _verdict(
-    before: PredictionScale, own: ScaleEstimate, own_sentence: str, known: list[ScaleEstimate]
-) -> _Verdict:
-    """Known sizes are combined with the map's own scale; the ground truth's trajectory replaces it."""
+def _verdict(before: PredictionScale, own: _Own, known: list[ScaleEstimate]) -> _Verdict:
+    """What was given is combined with the map's own scale; the ground truth's trajectory replaces it."""
     if not known:
-        return _Verdict(own, own_sentence, before.from_ground_truth)
+        return _Verdict(own.estimate, own.sentence, before.from_ground_truth)
     if before.wants_trajectory:
-        estimate = known[0]
-        sentence = (
-            f"the map was multiplied by {estimate.factor:.4g} (± {100 * estimate.sigma_log:.2g} %) after "
-            f"{estimate.how}"
-        )
-        return _Verdict(estimate, sentence, True)
-    together = [own, *known]
-    factor, sigma_log, weights = fused(together)
+        return _Verdict(known[0], multiplied_sentence(known[0]), True)
+    together = [own.estimate, *known]
+    result = fused(together)
     parts = tuple(
-        ScalePart(e.source, before.prediction_factor * e.factor, e.sigma_log, w)
-        for e, w in zip(together, weights, strict=True)
+        ScalePart(
+            estimate.source,
+            before.prediction_factor * estimate.factor,
+            estimate.sigma_log if estimate.is_stated else None,
+            weight,
+            estimate.how,
+        )
+        for estimate, weight in zip(together, result.weights, strict=True)
     )
     largest = max(parts, key=lambda part: part.weight).source
-    estimate = ScaleEstimate(largest, factor, sigma_log, "")
-    return _Verdict(estimate, _fused_sentence(together, weights, estimate), before.from_ground_truth, parts)
+    estimate = ScaleEstimate(largest, result.factor, result.sigma_log, "")
+    return _Verdict(estimate, fused_sentence(together, result), before.from_ground_truth, parts, result)
 
 
-def _known_sizes(
-    dataset: Dataset, reconstruction: Reconstruction, before: PredictionScale, config: Config
+def _with_inertial_gravity(
+    reconstruction: Reconstruction, config: Config
+) -> tuple[Reconstruction, list[ScaleEstimate], list[str]]:
+    """The map with gravity as inertial data tell it, what they say of the scale, and notes."""
+    if config.scale.imu is None:
+        return reconstruction, [], []
+    imu, notes = read_imu(config.scale.imu)
+    try:
+        estimate, fit = from_imu(reconstruction.trajectory, imu)
+    except DatasetError as error:
+        return reconstruction, [], [*notes, f"no scale from the inertial data: {error}"]
+    return replace(reconstruction, gravity_w=fit.gravity_w), [estimate], notes
+
+
+def _known_scales(
+    dataset: Dataset,
+    reconstruction: Reconstruction,
+    before: PredictionScale,
+    config: Config,
+    tell: ProgressCallback,
 ) -> tuple[list[ScaleEstimate], list[str]]:
-    """What each known size says of the scale, and a note for each that says nothing."""
+    """What the sizes given say of the scale, and a note for each that says nothing."""
     scale, trajectory = config.scale, reconstruction.trajectory
-    tries: list[tuple[str, Callable[[], ScaleEstimate]]] = []
+    tries: list[tuple[str, Callable[[], list[ScaleEstimate]]]] = []
     if before.wants_trajectory and (truth := dataset.ground_truth) is not None:
-        tries.append(("from the ground truth", lambda: from_ground_truth(truth, trajectory)))
+        tries.append(("from the ground truth", lambda: [from_ground_truth(truth, trajectory)]))
     if (height_m := scale.camera_height_m) is not None:
-        reach_m = config.map.max_depth_m
-        tries.append(
-            (
-                "from the camera height",
-                lambda: from_camera_height(
-                    reconstruction.keyframes, height_m, reach_m, reconstruction.gravity_w
-                ),
-            )
-        )
+        tries.append(("from the camera height", lambda: [from_camera_height(reconstruction, height_m)]))
     if (length_m := scale.baseline_m) is not None:
-        tries.append(
-            ("from the baseline", lambda: from_baseline(trajectory, length_m, scale.baseline_between_s))
-        )
-    found, notes = [], []
+        between_s = scale.baseline_between_s
+        tries.append(("from the baseline", lambda: [from_baseline(trajectory, length_m, between_s)]))
+
+    def show(done: int, total: int) -> None:
+        tell(RunProgress(RunStage.MARKERS, done, total))
+
+    for text in scale.marker:
+        find = partial(from_markers, dataset, reconstruction, MarkerSpec.parse(text), show)
+        tries.append((f"from marker {text}", find))
+    found: list[ScaleEstimate] = []
+    notes: list[str] = []
     for name, attempt in tries:
         try:
-            found.append(attempt())
+            found += attempt()
         except DatasetError as error:
             notes.append(f"no scale {name}: {error}")
     return found, notes
-
-
-def _own_sentence(before: PredictionScale, votes: int, spread: float | None, sigma_log: float) -> str:
-    if before.source is ScaleSource.SENSOR:
-        return f"metric, {before.how}"
-    agreed = ""
-    if spread is not None:
-        agreed = f", the robust centre over {votes} keyframes (their log ratios spread by {spread:.2f})"
-    sure = f"true metres within about {100 * sigma_log:.0f} %"
-    if before.source is ScaleSource.VALUE:
-        sure = "its accuracy is unknown"
-    else:
-        sure += " in two of three places, an assumption"
-    if before.source is ScaleSource.NETWORK:
-        return f"metric as far as the {before.how} is{agreed}; no sensor measured it: {sure}"
-    return f"{before.how}{agreed}: {sure}"
-
-
-def _measured_sentence(before: PredictionScale, measured: ScaleEstimate) -> str:
-    return (
-        f"{before.how}; then the map was multiplied by {measured.factor:.4g} after {measured.how}: true "
-        f"metres within about {100 * measured.sigma_log:.0f} %, one standard error"
-    )
-
-
-def _fused_sentence(together: list[ScaleEstimate], weights: tuple[float, ...], result: ScaleEstimate) -> str:
-    phrases = [
-        f"{e.how} (factor {e.factor:.3f} ± {100 * e.sigma_log:.2g} %, weight {100 * w:.3g} %)"
-        for e, w in zip(together, weights, strict=True)
-    ]
-    return (
-        f"the map was multiplied by {result.factor:.4g} (± {100 * result.sigma_log:.2g} %), combined by "
-        f"inverse variance of log scale from {'; '.join(phrases[1:])}; and {phrases[0]}"
-    )
-
-
-def _disagreements(own: ScaleEstimate, found: list[ScaleEstimate]) -> list[str]:
-    notes = []
-    for estimate in found:
-        ratio = estimate.factor / own.factor
-        apart = abs(math.log(ratio)) / math.hypot(own.sigma_log, estimate.sigma_log)
-        if apart > 3:
-            notes.append(
-                f"the scale by {estimate.source.value} and that of the depth differ by a factor of "
-                f"{ratio:.2f}, {apart:.1f} standard deviations: check the known size"
-            )
-    return notes

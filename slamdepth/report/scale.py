@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any
@@ -19,6 +20,20 @@ class ScaleSource(str, Enum):
     GROUND_TRUTH_TRAJECTORY = "groundtruth-trajectory"
     CAMERA_HEIGHT = "camera-height"
     BASELINE = "baseline"
+    MARKER = "marker"
+    IMU = "imu"
+
+
+def interval(sigma_log: float) -> tuple[float, float]:
+    """Factors between which a length is to one standard deviation ``sigma_log`` of its natural log."""
+    return math.exp(-sigma_log), math.exp(sigma_log)
+
+
+def interval_text(sigma_log: float) -> str:
+    """The interval for people, with as many digits as tell it from 1."""
+    digits = min(5, max(2, 1 - math.floor(math.log10(max(sigma_log, 1e-4)))))
+    low, high = interval(sigma_log)
+    return f"{low:.{digits}f} to {high:.{digits}f} of true metres, two in three"
 
 
 @dataclass(frozen=True)
@@ -28,14 +43,16 @@ class ScalePart:
     Attributes:
         source: where it comes from.
         factor: on the depth model's own lengths.
-        uncertainty_log: standard deviation of the natural log of ``factor``.
-        weight: its share in the combination, 0 to 1.
+        uncertainty_log: standard deviation of the natural log of ``factor``; None where it is unknown.
+        weight: its share in the combination, 0 to 1; 0 where it was left out.
+        how: what was compared, as a phrase.
     """
 
     source: ScaleSource
     factor: float
-    uncertainty_log: float
+    uncertainty_log: float | None
     weight: float
+    how: str = ""
 
 
 @dataclass(frozen=True)
@@ -46,10 +63,10 @@ class ScaleFacts:
         source: where it comes from; of several estimates, the one with the largest weight.
         factor: total factor on the depth model's own lengths; of a relative model, on its numbers.
         sentence: all of this for people.
-        uncertainty_log: standard deviation of the natural log of ``factor``, measured or assumed
-            (``sentence`` says which); None where it is unknown.
+        uncertainty_log: standard deviation of the natural log of ``factor``; None where it is unknown.
         keyframes: number of keyframes that voted on the map's scale.
-        spread: standard deviation of their votes (log ratios of map to predicted depth).
+        independent: number of independent votes among theirs.
+        spread: robust standard deviation of their votes (log ratios of map to predicted depth).
         prediction_factor: the part of ``factor`` that was applied to predictions; the rest was applied to
             the finished map.
         shift, shift_unit: added to the model's numbers after ``prediction_factor``, else None.
@@ -62,6 +79,7 @@ class ScaleFacts:
     sentence: str
     uncertainty_log: float | None = None
     keyframes: int = 0
+    independent: float | None = None
     spread: float | None = None
     prediction_factor: float = 1.0
     shift: float | None = None
@@ -69,9 +87,15 @@ class ScaleFacts:
     from_ground_truth: bool = False
     parts: tuple[ScalePart, ...] = ()
 
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Lengths of the map in true metres, lowest and highest in two cases of three; None where unknown."""
+        return None if self.uncertainty_log is None else interval(self.uncertainty_log)
+
     def to_dict(self) -> dict[str, Any]:
         """The facts as nested plain values, for ``report.json``."""
         values = asdict(self)
+        values["interval"] = None if self.interval is None else list(self.interval)
         values["source"] = self.source.value
         values["parts"] = [{**asdict(part), "source": part.source.value} for part in self.parts]
         return values

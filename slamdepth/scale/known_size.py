@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,18 +13,13 @@ from slamdepth.errors import DatasetError
 from slamdepth.evaluation import score_trajectory
 from slamdepth.evaluation.bootstrap import block_resamples
 from slamdepth.geometry import umeyama
-from slamdepth.mapping.floor import MAX_TILT_DEG, find_floor
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report import ScaleSource
+from slamdepth.scale.estimate import ScaleEstimate
 from slamdepth.types import Frame, Trajectory
 from slamdepth.typing import Floats
 
-HEIGHT_SIGMA_LOG = 0.03
-"""Standard deviation of the log of a camera height: how well it is measured, and how level a floor is."""
-PREDICTED_HEIGHT_SIGMA_LOG = 0.12
-"""Standard deviation of the log of a camera height over a floor of predicted depth: the error of a network on
-floors is common to all keyframes. With an earlier head it was 14 % in the rendered room."""
 LENGTH_SIGMA_LOG = 0.01
 """Standard deviation of the log of a distance that people measured."""
 SENSOR_SIGMA_LOG = 0.03
@@ -35,23 +30,6 @@ DRIFT = 0.01
 _MAX_GAP_S = 0.5
 _MAX_SIGMA_LOG = 0.3
 _FEWEST_POINTS = 20
-
-
-@dataclass(frozen=True)
-class ScaleEstimate:
-    """What the lengths of a map should be multiplied by, with its uncertainty.
-
-    Attributes:
-        source: where it comes from.
-        factor: on the map's lengths.
-        sigma_log: standard deviation of the natural log of ``factor``.
-        how: what was compared, as a phrase.
-    """
-
-    source: ScaleSource
-    factor: float
-    sigma_log: float
-    how: str
 
 
 def rescaled(reconstruction: Reconstruction, factor: float) -> Reconstruction:
@@ -77,48 +55,6 @@ def _moved(T: Floats, factor: float) -> Floats:
     out: Floats = T.copy()
     out[..., :3, 3] *= factor
     return out
-
-
-def fused(estimates: Sequence[ScaleEstimate]) -> tuple[float, float, tuple[float, ...]]:
-    """Independent estimates combined by inverse variance of the log.
-
-    Returns:
-        ``(factor, sigma_log, weights)``; the weights, one for each estimate, add up to 1.
-    """
-    information = np.array([estimate.sigma_log**-2 for estimate in estimates])
-    weights = information / information.sum()
-    log_factor = float(weights @ np.log([estimate.factor for estimate in estimates]))
-    return math.exp(log_factor), float(information.sum() ** -0.5), tuple(map(float, weights))
-
-
-def from_camera_height(
-    keyframes: Sequence[Keyframe], height_m: float, max_depth_m: float, gravity_w: Floats | None = None
-) -> ScaleEstimate:
-    """Compare the first camera's known height with that over the floor of the map.
-
-    Args:
-        keyframes: of the finished map.
-        height_m: the known height in metres.
-        max_depth_m: depth beyond it is not used.
-        gravity_w: ``(3,)`` unit direction of gravity in the world, where it is known.
-
-    Raises:
-        DatasetError: no floor is found.
-    """
-    floor = find_floor(keyframes, max_depth_m, gravity_w=gravity_w)
-    if floor is None:
-        held = f", the first camera upright to within {MAX_TILT_DEG:g} degrees" if gravity_w is None else ""
-        raise DatasetError(f"no floor was found below the first camera (a large level surface{held})")
-    level = (
-        "the first camera's y axis" if gravity_w is None else "level, by gravity as estimated from the images"
-    )
-    how = (
-        f"a camera height of {height_m:g} m against {floor.height:.2f} m over the lowest large level "
-        f"surface, which {floor.keyframes} keyframes see, {floor.tilt_deg:.0f} degrees from {level}"
-    )
-    is_sensor = any(keyframe.prediction.is_sensor for keyframe in keyframes)
-    sigma_log = math.hypot(HEIGHT_SIGMA_LOG if is_sensor else PREDICTED_HEIGHT_SIGMA_LOG, floor.sigma_log)
-    return ScaleEstimate(ScaleSource.CAMERA_HEIGHT, height_m / floor.height, sigma_log, how)
 
 
 def from_sensor(keyframes: Sequence[Keyframe], frames: Iterable[Frame]) -> ScaleEstimate:
