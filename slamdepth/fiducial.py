@@ -32,6 +32,7 @@ FAMILIES = {
 
 _SPEC = re.compile(r"([^:]+):([^:]+)(?::([^:]+))?")
 _LARGEST_M = 100.0
+_REACH_PX = 3.0  # of the search for an edge
 
 
 @dataclass(frozen=True)
@@ -96,10 +97,8 @@ class MarkerDetector:
     def __init__(self, spec: MarkerSpec) -> None:
         import cv2
 
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         self._spec = spec
-        self._detector = cv2.aruco.ArucoDetector(spec.dictionary(), parameters)
+        self._detector = cv2.aruco.ArucoDetector(spec.dictionary(), cv2.aruco.DetectorParameters())
 
     def find(self, image_rgb: NDArray[np.uint8]) -> dict[int, NDArray[np.float64]]:
         """Corners ``(4, 2)`` in raw pixels by number of each marker that an ``(H, W, 3)`` image shows once.
@@ -116,4 +115,46 @@ class MarkerDetector:
         for number, four in zip(np.ravel(numbers).tolist(), corners, strict=True):
             found.setdefault(number, []).append(np.asarray(four, dtype=np.float64).reshape(4, 2))
         wanted = found if self._spec.id is None else {self._spec.id: found.get(self._spec.id, [])}
-        return {number: seen[0] for number, seen in wanted.items() if len(seen) == 1}
+        return {number: _refined(grey, seen[0]) for number, seen in wanted.items() if len(seen) == 1}
+
+
+def _refined(grey: NDArray[np.uint8], corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners ``(4, 2)`` as the crossings of lines through the edges of the black square.
+
+    OpenCV's own refinement searches the corner in a window, which pulls blurred corners of a square inwards:
+    by 1 % of the side of a marker 50 pixels wide.
+    """
+    for _ in range(2):
+        lines = [_edge(grey, corners[k], corners[(k + 1) % 4], corners.mean(axis=0)) for k in range(4)]
+        if any(line is None for line in lines):
+            return corners
+        crossed = np.array([np.cross(a, b) for a, b in zip(lines[-1:] + lines[:-1], lines, strict=True)])
+        moved = crossed[:, :2] / crossed[:, 2:]
+        if not np.all(np.abs(moved - corners) < 2 * _REACH_PX):  # False for NaN
+            return corners
+        corners = moved
+    return corners
+
+
+def _edge(
+    grey: NDArray[np.uint8], a: NDArray[np.float64], b: NDArray[np.float64], inside: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """The line ``(3,)``, homogeneous, along which the image gets brighter between two corners."""
+    import cv2
+
+    along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
+    outwards = np.array([along[1], -along[0]])
+    outwards *= np.sign(outwards @ (a - inside))
+    steps = np.arange(-_REACH_PX, _REACH_PX + 0.01, 0.25)
+    foot = a + np.linspace(0.12, 0.88, max(8, int(np.linalg.norm(b - a))))[:, None] * (b - a)
+    at = (foot[:, None] + steps[:, None] * outwards).astype(np.float32)
+    values = cv2.remap(grey.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+    slope = np.maximum(np.diff(values, axis=1), 0.0) ** 2
+    total = slope.sum(axis=1)
+    clear = total > 0.1 * np.median(total)
+    if np.count_nonzero(clear) < 5 or total.max() <= 0:
+        return None
+    offset = slope[clear] @ ((steps[1:] + steps[:-1]) / 2) / total[clear]
+    points = (foot[clear] + offset[:, None] * outwards).astype(np.float32)
+    vx, vy, x, y = cv2.fitLine(points, cv2.DIST_HUBER, 0, 0.01, 0.01).ravel().astype(np.float64)
+    return np.array([vy, -vx, vx * y - vy * x])

@@ -24,6 +24,7 @@ from slamdepth.typing import Floats, Ints
 
 MAX_TILT_DEG = 35.0
 _KNOWN_TILT_DEG = 12.0  # gravity estimated from images errs by some degrees
+_TILT_SIGMA_DEG = 4.0  # how far, in two cases of three
 _LEVEL_TILT_DEG = 3.0  # of one level surface of a place against another
 _STRONG = 100  # points of a plane that tells what is level
 
@@ -34,9 +35,8 @@ _TRIALS = 500
 _MAX_SAMPLE = 1000  # points that a trial plane is compared with
 _MIN_POINTS, _MIN_SHARE = 25, 0.01  # on a plane, of all points below the horizon
 _MIN_FLOOR = 0.08  # share of the points below the horizon on a floor; less cannot be told from clutter
-_MAX_BENEATH = (
-    0.08  # share of the points below the horizon that may lie beneath a floor: mirrored, mismatched
-)
+_MAX_BENEATH = 0.03  # share of the points below the horizon that may lie beneath a floor
+_MAX_BENEATH_ROAD = 0.08  # the same of a few keyframes: mirrored, mismatched
 _WELL_SUPPORTED = 0.1  # share of the landmarks below the horizon on a plane that needs no dense depth
 _NEIGHBOURS = 2  # keyframes on either side of one whose own height is looked for
 _MAX_WINDOWS = 40
@@ -103,23 +103,36 @@ def find_floor(reconstruction: Reconstruction, *, seed: int = 0) -> Floor | None
     rng = np.random.default_rng(seed)
     rows, owner = observations(reconstruction)
     sparse = landmarks(reconstruction, rows, owner).below(gravity_w)
-    of_world = _one_plane(sparse, gravity_w, max_tilt_deg, rng)
+    level_w, level_tilt_deg = _level(sparse, gravity_w, max_tilt_deg, rng)
+    of_world = _one_plane(sparse, gravity_w, level_w, level_tilt_deg, rng)
     if of_world is None or of_world.share < _WELL_SUPPORTED:
         dense = dense_points(reconstruction, rows, owner, gravity_w, max_tilt_deg)
         if dense is not None:
             both = sparse.joined(dense.below(gravity_w))
-            of_world = _one_plane(both, gravity_w, max_tilt_deg, rng)
+            of_world = _one_plane(both, gravity_w, level_w, level_tilt_deg, rng)
     mounted = _mounted(reconstruction, rows, owner, gravity_w)
     if of_world is None or mounted is None:
         return of_world or mounted
     return mounted if mounted.keyframes > _CLEARER * of_world.keyframes else of_world
 
 
-def _one_plane(
+def _level(
     points: FloorPoints, gravity_w: Floats, max_tilt_deg: float, rng: np.random.Generator
+) -> tuple[Floats, float]:
+    """What is level by the strongest plane of landmarks, and how far other level planes tilt against it."""
+    if len(points) < _STRONG:
+        return gravity_w, max_tilt_deg
+    plane = _plane(points, points, gravity_w, max_tilt_deg, rng)
+    if plane is None or np.count_nonzero(np.abs(plane.beyond(points)) < _TOLERANCE) < _STRONG:
+        return gravity_w, max_tilt_deg
+    return plane.normal, _LEVEL_TILT_DEG
+
+
+def _one_plane(
+    points: FloorPoints, gravity_w: Floats, level_w: Floats, max_tilt_deg: float, rng: np.random.Generator
 ) -> Floor | None:
     """The floor as one plane of the world."""
-    plane = lowest_level(points, gravity_w, max_tilt_deg, rng)
+    plane = lowest_level(points, level_w, max_tilt_deg, rng)
     if plane is None:
         return None
     on_plane = np.abs(plane.beyond(points)) < _TOLERANCE
@@ -206,7 +219,7 @@ def _densest(heights: Floats) -> float | None:
     low, high = (np.searchsorted(logs, logs + side * _LOCAL_TOLERANCE) for side in (-1, 1))
     best = int(np.argmax(high - low))
     beneath = np.mean(logs > logs[best] + _BENEATH * _LOCAL_TOLERANCE)
-    return None if beneath > _MAX_BENEATH else math.exp(float(np.median(logs[low[best] : high[best]])))
+    return None if beneath > _MAX_BENEATH_ROAD else math.exp(float(np.median(logs[low[best] : high[best]])))
 
 
 def lowest_level(
@@ -219,7 +232,7 @@ def lowest_level(
 
     Args:
         gravity_w: ``(3,)`` unit direction.
-        max_tilt_deg: of the strongest plane against it; lower ones are nearly parallel to that one.
+        max_tilt_deg: of a plane against it.
     """
     pool = np.ones(len(points), dtype=np.bool_)
     found: _Plane | None = None
@@ -233,8 +246,6 @@ def lowest_level(
         beneath = beyond > _BENEATH * _TOLERANCE
         if count < least or np.count_nonzero(beneath) >= np.count_nonzero(pool):
             break
-        if found is None and count >= _STRONG:
-            gravity_w, max_tilt_deg = plane.normal, _LEVEL_TILT_DEG
         found, pool = plane, beneath
     if found is None or np.count_nonzero(pool) > _MAX_BENEATH * len(points):
         return None
@@ -266,7 +277,8 @@ def _plane(
     height = offsets[:, None] - normals @ thin.centre.T
     beyond = normals @ thin.points.T - offsets[:, None]
     count = np.count_nonzero((np.abs(beyond) < _TOLERANCE * height) & (height > 0), axis=1)
-    best = int(np.argmax(count))
+    tilt_deg = np.degrees(np.arccos(np.minimum(1.0, normals @ gravity_w)))
+    best = int(np.argmax(count * np.exp(-0.5 * (tilt_deg / _TILT_SIGMA_DEG) ** 2)))
     return _fitted(_Plane(normals[best], float(offsets[best])), points, gravity_w, least_cosine)
 
 
