@@ -49,7 +49,8 @@ SCALE = ScaleFacts(
     spread=0.1,
     parts=(
         ScalePart(ScaleSource.NETWORK, 1.0, 0.2, 0.02),
-        ScalePart(ScaleSource.CAMERA_HEIGHT, 1.21, 0.03, 0.98),
+        ScalePart(ScaleSource.CAMERA_HEIGHT, 1.21, 0.03, 0.98, "a camera height of 1.4 m"),
+        ScalePart(ScaleSource.MARKER, 3.0, None, 0.0, "a marker"),
     ),
 )
 

@@ -75,7 +75,7 @@ def test_summary_has_the_promised_keys_and_values() -> None:
     scale = summary["scale"]
     assert (scale["source"], scale["factor"], scale["uncertainty_log"]) == ("camera-height", 1.2, 0.03)
     assert (scale["keyframes"], scale["spread"], scale["sentence"]) == (6, 0.1, SCALE.sentence)
-    assert [part["source"] for part in scale["parts"]] == ["network", "camera-height"]
+    assert [part["source"] for part in scale["parts"]] == ["network", "camera-height", "marker"]
     assert summary["mesh"] == {"vertices": 1234, "triangles": 5678}
     assert summary["weights"][0] == {
         "name": "head & backbone",

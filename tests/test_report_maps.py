@@ -71,8 +71,8 @@ def test_the_table_names_every_map_only_where_there_are_several() -> None:
         "3 that never met: no common frame, each with its own scale; two maps met and were joined 1 time"
     )
     assert "2.7-2.9 s · 6 (6.7 %) frames" in shown["  map 2"]
-    assert "scale × 1.2, ± 3 %" in shown["  map 2"]
-    assert "uncertainty unknown" in shown["  map 3"]
+    assert "scale × 1.2, 0.97 to 1.03 of true metres" in shown["  map 2"]
+    assert "accuracy unknown" in shown["  map 3"]
     assert "ATE Sim(3)" in shown["  map 1, the largest"]
     assert "maps" not in rows_of(run_table(build_summary(full_data())))
     assert about_maps(1, 2) == "1; two maps met and were joined 2 times"

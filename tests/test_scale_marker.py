@@ -19,6 +19,9 @@ from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.fiducial import FAMILIES, MarkerDetector, MarkerSpec
 from slamdepth.geometry import se3_exp, so3_exp
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.pipeline.prediction_scale import PredictionScale
+from slamdepth.pipeline.scale import settle_scale
+from slamdepth.report import ScaleSource
 from slamdepth.scale.marker import from_markers
 from slamdepth.scale.marker_fit import Sighting, fit_marker
 from slamdepth.synth.sequence import SynthSettings
@@ -85,6 +88,9 @@ def test_a_marker_is_refused_before_the_run(tmp_path: Path) -> None:
     done = call("run", tmp_path, "--marker", "tag99:0.1")
     assert done.returncode == 2
     assert "unknown family 'tag99'" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    done = call("run", tmp_path, "--imu", tmp_path / "no.csv")
+    assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
     done = call("synth", tmp_path / "hall", "--scene", "aliased", "--marker", "tag36h11:0.1")
     assert done.returncode == 2
@@ -191,3 +197,23 @@ def test_a_marker_seen_from_one_side_only_is_refused_in_one_line() -> None:
     assert "\n" not in str(raised.value)
     with pytest.raises(DatasetError, match="no tag36h11 marker was found in 10 images"):
         from_markers(dataset, mapped(dataset, 1.0), MarkerSpec("tag36h11", 0.2))
+
+
+def test_markers_scale_a_run_and_the_report_names_each(tmp_path: Path) -> None:
+    dataset = Wall(views(15, 0.6))
+    before = PredictionScale(ScaleSource.NETWORK, "depth predicted by x", None)
+    config = Config.from_dict({"scale": {"marker": ["DICT_4X4_50:0.2", "tag16h5:0.1"]}})
+    stages: list[str] = []
+    made, facts, notes = settle_scale(
+        dataset, mapped(dataset, 0.25), before, config, lambda step: stages.append(step.stage.value)
+    )
+    assert facts.factor == pytest.approx(4.0, rel=0.01)
+    assert facts.interval is not None
+    assert [(part.source, part.weight) for part in facts.parts] == [
+        (ScaleSource.NETWORK, 0),
+        (ScaleSource.MARKER, 1),
+    ]
+    assert "of true metres, two in three" in facts.sentence
+    assert notes == ("no scale from marker tag16h5:0.1: no tag16h5 marker was found in 15 images",)
+    assert set(stages) == {"looking for markers"}
+    np.testing.assert_allclose(made.trajectory.T_world_camera[:, :3, 3], dataset._poses[:, :3, 3], atol=0.02)

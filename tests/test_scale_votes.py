@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_up import MadeUpDataset
 
+from slamdepth.config import Config
 from slamdepth.depth.alignment import as_given
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.pipeline.prediction_scale import PredictionScale
+from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.scale_sentence import UNKNOWN, own_sentence
 from slamdepth.report import ScaleFacts, ScaleSource
-from slamdepth.report.scale import interval_text
+from slamdepth.report.scale import accuracy_text
 from slamdepth.scale.estimate import ScaleEstimate, fused
 from slamdepth.scale.votes import (
     common_sigma_log,
@@ -84,6 +88,15 @@ def test_images_like_nothing_the_model_knows_make_the_scale_unknown() -> None:
     sentence = own_sentence(ScaleEstimate(ScaleSource.NETWORK, 1.0, voted.sigma_log, "x"), voted)
     assert sentence == UNKNOWN
     assert "give --depth NAME, --marker, --camera-height or --baseline-m" in sentence
+    _, facts, _ = settle_scale(
+        MadeUpDataset(9),
+        run_of(noise(9, 0.1), math.inf),
+        PredictionScale(ScaleSource.NETWORK, "x", None),
+        Config(),
+    )
+    assert facts.is_unknown
+    assert (facts.uncertainty_log, facts.interval, facts.sentence) == (None, None, UNKNOWN)
+    assert "Infinity" not in json.dumps(facts.to_dict())
 
 
 def test_correlated_votes_count_for_fewer() -> None:
@@ -133,8 +146,8 @@ def test_a_drift_is_told_from_scatter() -> None:
 
 
 def test_the_interval_is_said_in_words_and_in_numbers() -> None:
-    assert interval_text(0.1655) == "0.85 to 1.18 of true metres, two in three"
-    assert interval_text(0.004) == "0.9960 to 1.0040 of true metres, two in three"
+    assert accuracy_text(0.1655) == "0.85 to 1.18 of true metres, two in three"
+    assert accuracy_text(0.004) == "0.9960 to 1.0040 of true metres, two in three"
     facts = ScaleFacts(ScaleSource.NETWORK, 1.0, "", uncertainty_log=0.1)
     assert json.loads(json.dumps(facts.to_dict()))["interval"] == pytest.approx([0.905, 1.105], abs=1e-3)
     assert ScaleFacts(ScaleSource.NETWORK, 1.0, "").to_dict()["interval"] is None

@@ -133,7 +133,7 @@ def judge_health(
             is_measured,
             config.tracking.min_inliers,
             tuple(MapFacts(one.trajectory, one.points_m, one.statistics) for one in reconstruction.others),
-            scale_is_known=scale.uncertainty_log is not None,
+            scale_is_known=not scale.is_unknown,
         )
     )
     logger.info("verdict: %s. %s", health.verdict.value, health.headline)

@@ -138,6 +138,8 @@ def _facts(before: PredictionScale, voted: VotedScale, verdict: _Verdict, senten
         prediction_factor=before.prediction_factor,
         shift=None if shifted is None else shifted.shift,
         shift_unit=None if shifted is None else shifted.domain.shift_unit,
+        is_unknown=not estimate.is_stated
+        and (estimate.sigma_log is not None or estimate.source is ScaleSource.VALUE),
         from_ground_truth=verdict.from_ground_truth,
         parts=verdict.parts,
     )

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from slamdepth.pipeline.prediction_scale import PredictionScale
 from slamdepth.report import ScaleSource
-from slamdepth.report.scale import interval_text
+from slamdepth.report.scale import accuracy_text
 from slamdepth.scale.estimate import AGREE, Fused, ScaleEstimate, apart
 from slamdepth.scale.votes import VotedScale
 
@@ -35,7 +35,7 @@ def own_sentence(own: ScaleEstimate, voted: VotedScale) -> str:
             agreed += f"; from first to last they drift by a factor of {math.exp(voted.drift):.2f}"
         agreed += ")"
     if own.sigma_log is not None:
-        sure = interval_text(own.sigma_log)
+        sure = accuracy_text(own.sigma_log)
     elif own.source is ScaleSource.VALUE:
         sure = "its accuracy is unknown"
     else:
@@ -55,7 +55,7 @@ def multiplied_sentence(estimate: ScaleEstimate) -> str:
     assert estimate.sigma_log is not None
     return (
         f"the map was multiplied by {estimate.factor:.4g} after {estimate.how}: "
-        f"{interval_text(estimate.sigma_log)}"
+        f"{accuracy_text(estimate.sigma_log)}"
     )
 
 
@@ -66,7 +66,7 @@ def fused_sentence(together: Sequence[ScaleEstimate], result: Fused) -> str:
     if result.contradict:
         how += ", although they contradict each other"
     return (
-        f"the map was multiplied by {result.factor:.4g}: {interval_text(result.sigma_log)}; combined {how} "
+        f"the map was multiplied by {result.factor:.4g}: {accuracy_text(result.sigma_log)}; combined {how} "
         f"from {'; '.join(phrases[1:])}; and {phrases[0]}"
     )
 

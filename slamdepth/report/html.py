@@ -11,6 +11,7 @@ from slamdepth.report.data import ReportData
 from slamdepth.report.keyframe_images import NEAR_TO_FAR, UNKNOWN, jpeg_address, keyframe_gallery
 from slamdepth.report.maps import MAP_HEADS, about_maps, map_rows, maps_plot
 from slamdepth.report.page import render
+from slamdepth.report.scale import scale_interval, scale_rows
 from slamdepth.report.speed import speed_caption, speed_plot, stage_times
 from slamdepth.report.text import MISSING, count, fixed
 
@@ -48,6 +49,8 @@ def build_html(data: ReportData, summary: dict[str, Any]) -> str:
         ],
         speed_caption=speed_caption(summary["wall_s"]),
         weight_rows=[[w["name"], w["trained_on"], w["licence"], w["sha256"]] for w in summary["weights"]],
+        scale_rows=scale_rows(data.scale),
+        scale_interval=scale_interval(data.scale),
         files=data.files,
         origin_rows=[
             [name.replace("_", " "), MISSING if value is None else str(value)]

@@ -156,9 +156,9 @@ def _when(stretches: Sequence[Sequence[float]]) -> str:
 
 
 def _scale(scale: dict[str, Any]) -> str:
-    """The factor on the depth model's lengths and its uncertainty, one standard deviation."""
-    sigma_log = scale["uncertainty_log"]
-    sure = "uncertainty unknown" if sigma_log is None else f"± {percent(sigma_log, 0)}"
+    """The factor on the depth model's lengths, and the interval of lengths in two cases of three."""
+    found = scale["interval"]
+    sure = "accuracy unknown" if found is None else f"{found[0]:.2f} to {found[1]:.2f} of true metres"
     return f"× {scale['factor']:.3g}, {sure}"
 
 

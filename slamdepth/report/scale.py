@@ -33,7 +33,12 @@ def interval_text(sigma_log: float) -> str:
     """The interval for people, with as many digits as tell it from 1."""
     digits = min(5, max(2, 1 - math.floor(math.log10(max(sigma_log, 1e-4)))))
     low, high = interval(sigma_log)
-    return f"{low:.{digits}f} to {high:.{digits}f} of true metres, two in three"
+    return f"{low:.{digits}f} to {high:.{digits}f}"
+
+
+def accuracy_text(sigma_log: float) -> str:
+    """How sure a scale is, in words."""
+    return f"{interval_text(sigma_log)} of true metres, two in three"
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,7 @@ class ScaleFacts:
         prediction_factor: the part of ``factor`` that was applied to predictions; the rest was applied to
             the finished map.
         shift, shift_unit: added to the model's numbers after ``prediction_factor``, else None.
+        is_unknown: True where nothing is known of the size of the map.
         from_ground_truth: True where the scale was taken from what the run is scored by.
         parts: the estimates that were combined, where there were several.
     """
@@ -84,6 +90,7 @@ class ScaleFacts:
     prediction_factor: float = 1.0
     shift: float | None = None
     shift_unit: str | None = None
+    is_unknown: bool = False
     from_ground_truth: bool = False
     parts: tuple[ScalePart, ...] = ()
 
@@ -99,3 +106,22 @@ class ScaleFacts:
         values["source"] = self.source.value
         values["parts"] = [{**asdict(part), "source": part.source.value} for part in self.parts]
         return values
+
+
+def scale_interval(facts: ScaleFacts) -> str | None:
+    """The interval of a run's scale, None where it is unknown."""
+    return None if facts.uncertainty_log is None else interval_text(facts.uncertainty_log)
+
+
+def scale_rows(facts: ScaleFacts) -> list[list[str]]:
+    """One row for each estimate that was combined: source, factor, interval, weight, what was compared."""
+    return [
+        [
+            part.source.value,
+            f"{part.factor:.4g}",
+            "unknown" if part.uncertainty_log is None else interval_text(part.uncertainty_log),
+            f"{100 * part.weight:.3g} %" if part.weight > 0 else "left out",
+            part.how,
+        ]
+        for part in facts.parts
+    ]
