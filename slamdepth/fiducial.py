@@ -107,7 +107,7 @@ class MarkerDetector:
         """
         import cv2
 
-        grey = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
+        grey = np.asarray(cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         corners, numbers, _ = self._detector.detectMarkers(grey)
         if numbers is None:
             return {}
@@ -125,8 +125,10 @@ def _refined(grey: NDArray[np.uint8], corners: NDArray[np.float64]) -> NDArray[n
     by 1 % of the side of a marker 50 pixels wide.
     """
     for _ in range(2):
-        lines = [_edge(grey, corners[k], corners[(k + 1) % 4], corners.mean(axis=0)) for k in range(4)]
-        if any(line is None for line in lines):
+        inside = corners.mean(axis=0)
+        found = (_edge(grey, corners[k], corners[(k + 1) % 4], inside) for k in range(4))
+        lines = [line for line in found if line is not None]
+        if len(lines) < 4:
             return corners
         crossed = np.array([np.cross(a, b) for a, b in zip(lines[-1:] + lines[:-1], lines, strict=True)])
         moved = crossed[:, :2] / crossed[:, 2:]
