@@ -11,10 +11,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_up import MadeUpDataset
 
+from slamdepth.config import Config
 from slamdepth.errors import DatasetError
 from slamdepth.geometry import so3_exp, so3_log
 from slamdepth.io.imu import STANDARD_GRAVITY, ImuData, read_imu
+from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.pipeline.prediction_scale import PredictionScale
+from slamdepth.pipeline.scale import settle_scale
+from slamdepth.report import ScaleSource
 from slamdepth.scale.imu import from_imu
 from slamdepth.scale.inertial import align_inertial
 from slamdepth.types import Trajectory
@@ -142,6 +148,26 @@ def test_too_short_a_time_is_refused() -> None:
     path, imu, _ = recorded(Walk(5), seconds=0.5)
     with pytest.raises(DatasetError, match="too few frames in a row"):
         align_inertial(path, imu)
+
+
+def test_inertial_data_scale_a_run_and_tell_gravity(tmp_path: Path) -> None:
+    path, imu, down = recorded(Walk(1))
+    file = tmp_path / "imu.csv"
+    table = np.column_stack([imu.times_s, imu.rates, imu.forces])
+    np.savetxt(file, table, delimiter=",", header="time [s],gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z")
+    made = Reconstruction(path, (), np.ones((3, 3)))
+    before = PredictionScale(ScaleSource.NETWORK, "depth predicted by x", None)
+    config = Config.from_dict({"scale": {"imu": str(file)}})
+    scaled, facts, notes = settle_scale(MadeUpDataset(5), made, before, config)
+    assert (facts.source, notes) == (ScaleSource.IMU, ())
+    assert facts.factor == pytest.approx(2.5, rel=0.01)
+    assert scaled.gravity_w is not None
+    assert float(scaled.gravity_w @ down) > math.cos(math.radians(1.0))
+    config = Config.from_dict({"scale": {"imu": str(tmp_path / "other.csv")}})
+    (tmp_path / "other.csv").write_text(file.read_text().replace("0", "1"))
+    same, facts, notes = settle_scale(MadeUpDataset(5), made, before, config)
+    assert same is made
+    assert any(note.startswith("no scale from the inertial data: ") for note in notes)
 
 
 # --- files ---------------------------------------------------------------------------------

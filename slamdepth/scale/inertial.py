@@ -15,26 +15,28 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
 from slamdepth.errors import DatasetError
 from slamdepth.geometry import so3_log
-from slamdepth.io.imu import STANDARD_GRAVITY, ImuData
+from slamdepth.io.imu import ImuData
+from slamdepth.scale.inertial_windows import (
+    MAX_STEP_S,
+    at_times,
+    integral,
+    jackknife,
+    solve,
+    windows_of,
+)
 from slamdepth.types import Trajectory
 from slamdepth.typing import Floats
 
-_MAX_STEP_S = 0.5  # between poses that tell an angular velocity
 _RATE_HZ = 100.0
 _MIN_CORRELATION = 0.6
 _RIVAL_S = 0.5  # another peak of the correlation this far away is another offset
 _MAX_ROTATION_DEG = 3.0  # standard error of the rotation between camera and sensor
-_WINDOW_S = (1.0, 4.0)
-_WINDOWS = 8
 _FEWEST_WINDOWS = 4
-_LEVER_SIGMA_M = 0.1
-_BIAS_SIGMA = 0.3  # m/s^2, of a phone's accelerometer
 _MAX_SIGMA_LOG = 0.2
 
 
@@ -77,15 +79,15 @@ def align_inertial(trajectory: Trajectory, imu: ImuData) -> InertialFit:
     motion = _turning(trajectory)
     offset_s = _coarse_offset(motion, imu)
     offset_s, R_camera_imu, gyro_bias = _rotation(motion, imu, offset_s)
-    windows = _windows(trajectory, imu, offset_s, R_camera_imu)
+    windows = windows_of(trajectory, imu, offset_s, R_camera_imu)
     if len(windows) < _FEWEST_WINDOWS:
         raise DatasetError("the camera was tracked together with inertial data for too short a time")
-    fit = _solve(windows)
+    fit = solve(windows)
     is_reversed = fit.scale < 0
     if is_reversed:
         windows = [replace(window, twice=-window.twice, of_bias=-window.of_bias) for window in windows]
-        fit = _solve(windows)
-    sigma_log = _jackknife(windows, fit.scale)
+        fit = solve(windows)
+    sigma_log = jackknife(windows, fit.scale)
     if not (fit.scale > 0 and sigma_log <= _MAX_SIGMA_LOG):
         sure = f"{100 * sigma_log:.0f} %" if math.isfinite(sigma_log) else "any factor"
         raise DatasetError(
@@ -118,7 +120,7 @@ class _Turning:
 def _turning(trajectory: Trajectory) -> _Turning:
     times_s, R = trajectory.timestamps_s, trajectory.T_world_camera[:, :3, :3]
     step_s = np.diff(times_s)
-    keep = step_s <= _MAX_STEP_S
+    keep = step_s <= MAX_STEP_S
     if np.count_nonzero(keep) < 20:
         raise DatasetError("too few frames in a row have a pose to be compared with inertial data")
     turn = so3_log(np.swapaxes(R[:-1], 1, 2) @ R[1:])
@@ -127,23 +129,9 @@ def _turning(trajectory: Trajectory) -> _Turning:
 
 def _mean_rates(imu: ImuData, start_s: Floats, end_s: Floats) -> Floats:
     """Mean angular velocity ``(N, 3)`` of the sensor over intervals, NaN beyond its data."""
-    total = _integral(imu.times_s, imu.rates)
-    a, b = (_at(imu.times_s, total, t) for t in (start_s, end_s))
+    total = integral(imu.times_s, imu.rates)
+    a, b = (at_times(imu.times_s, total, t) for t in (start_s, end_s))
     return np.asarray((b - a) / (end_s - start_s)[:, None])
-
-
-def _integral(times_s: Floats, values: Floats) -> Floats:
-    """Integral ``(N, ...)`` from the first time by the trapezoidal rule."""
-    step = np.diff(times_s).reshape(-1, *([1] * (values.ndim - 1)))
-    return np.concatenate(
-        [np.zeros((1, *values.shape[1:])), np.cumsum((values[1:] + values[:-1]) / 2 * step, axis=0)]
-    )
-
-
-def _at(times_s: Floats, values: Floats, wanted_s: Floats) -> Floats:
-    """Values ``(N, 3)`` interpolated to ``wanted_s (M,)``; NaN outside."""
-    columns = [np.interp(wanted_s, times_s, column, left=np.nan, right=np.nan) for column in values.T]
-    return np.stack(columns, axis=1)
 
 
 def _coarse_offset(motion: _Turning, imu: ImuData) -> float:
@@ -239,124 +227,3 @@ def _kabsch(motion: _Turning, imu: ImuData, offset_s: float) -> tuple[Floats, Fl
         float(np.mean(np.minimum(off, 4 * spread) ** 2)),
         math.degrees(sigma),
     )
-
-
-@dataclass(frozen=True)
-class _Window:
-    """Poses of some seconds, and what the accelerometer makes of them.
-
-    Attributes:
-        elapsed_s: ``(n,)`` since the first.
-        places: ``(n, 3)`` in metres of the map.
-        R_world_camera: ``(n, 3, 3)``.
-        twice: ``(n, 3)`` specific force in the world, integrated twice.
-        of_bias: ``(n, 3, 3)`` what a unit of bias adds to it.
-    """
-
-    elapsed_s: Floats
-    places: Floats
-    R_world_camera: Floats
-    twice: Floats
-    of_bias: Floats
-
-    def rows(self, gravity: Floats) -> tuple[Floats, Floats]:
-        """Coefficients ``(3 n, 9)`` of scale, lever arm, bias and gravity's two directions, and the rest.
-
-        Start and velocity of the window are projected out.
-        """
-        t = self.elapsed_s
-        basis = np.linalg.qr(np.column_stack([np.ones_like(t), t]))[0]
-        tangent = np.linalg.svd(gravity[None, :])[2][1:].T * np.linalg.norm(gravity)
-        fall = (t**2 / 2)[:, None, None]
-        terms = np.concatenate(
-            [self.places[:, :, None], self.R_world_camera, self.of_bias, -fall * tangent], axis=2
-        )
-        rest = self.twice + fall[:, :, 0] * gravity
-
-        def free(values: Floats) -> Floats:
-            flat = values.reshape(len(t), -1)
-            return np.asarray((flat - basis @ (basis.T @ flat)).reshape(values.shape))
-
-        return free(terms).reshape(-1, 9), free(rest).ravel()
-
-
-def _windows(trajectory: Trajectory, imu: ImuData, offset_s: float, R_camera_imu: Floats) -> list[_Window]:
-    times_s = trajectory.timestamps_s
-    inside = (times_s + offset_s >= imu.times_s[0]) & (times_s + offset_s <= imu.times_s[-1])
-    times_s, T = times_s[inside], trajectory.T_world_camera[inside]
-    if len(times_s) < 20:
-        return []
-    length_s = float(np.clip((times_s[-1] - times_s[0]) / _WINDOWS, *_WINDOW_S))
-    found = []
-    breaks = np.flatnonzero(np.diff(times_s) > _MAX_STEP_S) + 1
-    for piece in np.split(np.arange(len(times_s)), breaks):
-        span_s = times_s[piece[-1]] - times_s[piece[0]]
-        count = max(1, math.floor(span_s / length_s))
-        edges = np.linspace(times_s[piece[0]], times_s[piece[-1]], count + 1)
-        for low, high in pairwise(edges):
-            mine = piece[(times_s[piece] >= low) & (times_s[piece] <= high)]
-            if len(mine) >= 8 and high - low >= 0.5 * length_s:
-                found.append(_window(times_s[mine], T[mine], imu, offset_s, R_camera_imu))
-    return found
-
-
-def _window(
-    times_s: Floats, T_world_camera: Floats, imu: ImuData, offset_s: float, R_camera_imu: Floats
-) -> _Window:
-    from scipy.spatial.transform import Rotation, Slerp
-
-    own_s = imu.times_s - offset_s
-    between = own_s[(own_s > times_s[0]) & (own_s < times_s[-1])]
-    fine_s = np.union1d(times_s, between)
-    R = Slerp(times_s, Rotation.from_matrix(T_world_camera[:, :3, :3]))(fine_s).as_matrix() @ R_camera_imu
-    force = np.einsum("nij,nj->ni", R, _at(own_s, imu.forces, fine_s))
-    at = np.searchsorted(fine_s, times_s)
-    twice = _integral(fine_s, _integral(fine_s, force))[at]
-    of_bias = _integral(fine_s, _integral(fine_s, R))[at]
-    return _Window(times_s - times_s[0], T_world_camera[:, :3, 3], T_world_camera[:, :3, :3], twice, of_bias)
-
-
-@dataclass(frozen=True)
-class _Solution:
-    scale: float
-    bias: Floats
-    gravity: Floats
-
-
-def _solve(windows: list[_Window]) -> _Solution:
-    """Least squares with gravity of known length, and weak priors on lever arm and bias."""
-    gravity = _first_gravity(windows)
-    weights = np.ones(len(windows))
-    x = np.zeros(9)
-    sigma = 0.01
-    for _ in range(8):
-        rows = [window.rows(gravity) for window in windows]
-        J = np.concatenate([w * J for w, (J, _) in zip(weights, rows, strict=True)])
-        r = np.concatenate([w * r for w, (_, r) in zip(weights, rows, strict=True)])
-        prior = np.diag([0.0, *[sigma / _LEVER_SIGMA_M] * 3, *[sigma / _BIAS_SIGMA] * 3, 0.0, 0.0])
-        # where gravity turns too far at once, the step is held
-        x = np.linalg.lstsq(np.concatenate([J, prior]), np.concatenate([r, np.zeros(9)]), rcond=None)[0]
-        tangent = np.linalg.svd(gravity[None, :])[2][1:].T * np.linalg.norm(gravity)
-        gravity = gravity + tangent @ np.clip(x[7:9], -0.5, 0.5)
-        gravity *= STANDARD_GRAVITY / np.linalg.norm(gravity)
-        rms = np.array([math.sqrt(float(np.mean((J @ x - r) ** 2))) for J, r in rows])
-        sigma = max(float(np.median(rms)), 1e-5)
-        weights = 1.0 / np.maximum(1.0, rms / (2.0 * sigma))
-    return _Solution(float(x[0]), x[4:7], gravity)
-
-
-def _first_gravity(windows: list[_Window]) -> Floats:
-    """Against the mean specific force in the world, since accelerations average out."""
-    force = [np.asarray(2 * w.twice[-1] / w.elapsed_s[-1] ** 2) for w in windows]
-    mean = -np.median(force, axis=0)
-    return np.asarray(mean * STANDARD_GRAVITY / max(float(np.linalg.norm(mean)), 1e-9))
-
-
-def _jackknife(windows: list[_Window], scale: float) -> float:
-    """Standard error of the log of the scale, from the scales without one window each (Tukey 1958)."""
-    count = len(windows)
-    without = [_solve(windows[:k] + windows[k + 1 :]).scale for k in range(count)]
-    if scale <= 0 or min(without) <= 0:
-        return math.inf
-    logs = np.log(without)
-    return math.sqrt((count - 1) / count * float(np.sum((logs - logs.mean()) ** 2)))
