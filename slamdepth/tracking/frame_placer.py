@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import orthonormalised
 from slamdepth.loops.look_alikes import Reach
@@ -23,7 +22,6 @@ from slamdepth.typing import Floats
 
 log = logging.getLogger(__name__)
 
-_FEW_OF_EXPECTED = 0.25  # landmarks that agree, of those expected; where motion leads, most do
 _SAME_MOTION = 0.8  # of a frame's landmarks agree still; of consecutive frames 0.92 and more
 
 
@@ -52,11 +50,8 @@ class FramePlacer:
         wide_features: finds more features of a frame, for a search over a wide baseline.
     """
 
-    def __init__(
-        self, parts: MapParts, config: Config, watch: Stopwatch, wide_features: Callable[[Frame], Features]
-    ) -> None:
+    def __init__(self, parts: MapParts, watch: Stopwatch, wide_features: Callable[[Frame], Features]) -> None:
         self._parts = parts
-        self._few = config.tracking.keyframe_min_inliers
         self._watch = watch
         self._wide_features = wide_features
 
@@ -67,13 +62,9 @@ class FramePlacer:
             raw = self._wide_features(frame)
         with self._watch.timed("tracking"):
             features = parts.shutter.correct_by_motion(raw, parts.motion, frame.timestamp_s)
-            usual = self._place(frame, features)
-            doubtful = usual if self._is_doubtful(usual) else None
-            placement = None if doubtful else self._count(frame, features, usual)
+            placement = self._place(frame, features)
             if placement is None and parts.view_change.count_lost():
-                raw, features, placement = self._place_wide(frame, raw, features, doubtful)
-            elif placement is None:
-                placement = self._count(frame, features, doubtful)
+                raw, features, placement = self._place_wide(frame, raw)
             placement = placement or self._register(frame, features)
             if placement is None:
                 self._lose()
@@ -105,28 +96,11 @@ class FramePlacer:
             placement = placement or parts.localiser.from_keyframe(features, newest)
         else:
             parts.relocaliser.schedule.count_frame()
-        return placement or parts.relocaliser.by_place(features, without=newest, reach=self._reach())
+        placement = placement or parts.relocaliser.by_place(features, without=newest, reach=self._reach())
+        return self._count(frame, features, placement)
 
-    def _is_doubtful(self, placement: Placement | None) -> bool:
-        """Whether no motion led to a pose, or so few landmarks agree that the step may have been a large one.
-
-        Within a wide search window and along the ray of an uncertain depth, dozens agree by chance.
-        """
-        if placement is None or self._parts.view_change.is_large:
-            return False
-        if placement.placed_by is not PlacedBy.MOTION:
-            return True
-        share = placement.inliers / max(len(placement.expected_ids), 1)
-        return placement.inliers < self._few and share < _FEW_OF_EXPECTED
-
-    def _place_wide(
-        self, frame: Frame, raw: Features, features: Features, usual: Placement | None
-    ) -> tuple[Features, Features, Placement | None]:
-        """Place a frame by more features and over a wide baseline.
-
-        Args:
-            usual: what the usual ways found, if anything; kept where this does not explain significantly
-                more.
+    def _place_wide(self, frame: Frame, raw: Features) -> tuple[Features, Features, Placement | None]:
+        """Place a frame that the usual ways did not place by more features and over a wide baseline.
 
         Returns:
             Its features, raw and to go on with, and the placement; those given where it is still lost.
@@ -139,12 +113,10 @@ class FramePlacer:
         parts.view_change.is_large = True
         is_lost = not parts.motion.is_known
         found = parts.relocaliser.by_recent(wide, is_lost=is_lost, reach=self._reach())
-        placement = None
-        if found is not None and (usual is None or found.inliers > _more_than(usual.inliers)):
-            placement = self._count(frame, wide, found)
+        placement = self._count(frame, wide, found)
         if placement is None:
             parts.view_change.is_large = was_large
-            return (raw, raw, None) if usual is None else (raw, features, self._count(frame, features, usual))
+            return raw, raw, None
         parts.view_change.found_wide()
         return wide, wide, placement
 
@@ -235,8 +207,3 @@ class FramePlacer:
             return carried
         self._parts.map.count_views(refined.expected_ids, refined.found_ids)
         return refined
-
-
-def _more_than(inliers: int) -> float:
-    """A number of matches that is significantly more than another, by Poisson statistics."""
-    return float(inliers + 5.0 * np.sqrt(inliers))

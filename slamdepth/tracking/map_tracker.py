@@ -68,7 +68,7 @@ class MapTracker(MapParts):
     ) -> None:
         super().__init__(id_, camera, config, levels, workers, watch)
         self._wide_features = wide_features
-        self._placer = FramePlacer(self, config, watch, wide_features)
+        self._placer = FramePlacer(self, watch, wide_features)
 
     def start(self, frame: Frame, features: Features) -> Placed | None:
         """Start the map with a frame; None where its depth does not create enough landmarks."""
