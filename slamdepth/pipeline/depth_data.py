@@ -13,7 +13,7 @@ from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.errors import DatasetError
 from slamdepth.pipeline.training_data import SequencePlace, sequence_readers
-from slamdepth.training.data import Place, data_folder, known_readers, open_place
+from slamdepth.training.data import Place, data_folder, known_readers, open_place, split_numbers
 from slamdepth.types import Frame
 
 logger = logging.getLogger(__name__)
@@ -28,7 +28,8 @@ def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
     these in folders of their own.
 
     Args:
-        path: absolute, relative to the current folder, or below ``$SLAMDEPTH_DATA``.
+        path: absolute, relative to the current folder, or below ``$SLAMDEPTH_DATA``; ``NAME[FIRST-LAST]``
+            for some of the numbered pairs in a folder.
         camera: a ``camera.yaml`` for a sequence.
 
     Raises:
@@ -55,9 +56,10 @@ def _contents(path: Path) -> tuple[list[Path], list[Path]]:
     try:
         if path.is_file():
             raise DatasetError(f"{path}: is a file; name a folder of images with depth")
-        folder = data_folder(str(path))
+        whole, numbers = split_numbers(path)
+        folder = data_folder(str(whole))
         if _is_place(folder):
-            return [folder], []
+            return [folder if numbers is None else folder.with_name(path.name)], []
         if _is_sequence(folder):
             return [], [folder]
     except OSError as error:

@@ -12,7 +12,7 @@ from slamdepth.depth import weights as store
 from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
 from slamdepth.errors import ConfigError
 from slamdepth.training.config import SourceConfig, Supervision, TrainConfig, ViewConfig, digest
-from slamdepth.training.data import Place, PlaceReader, data_folder, open_place
+from slamdepth.training.data import Place, PlaceReader, data_folder, open_place, split_numbers
 from slamdepth.training.features import FeatureCache, build_cache
 from slamdepth.training.progress import Progress, silent
 from slamdepth.training.views import Partner, SampleKey, plan_samples, plan_unaugmented
@@ -141,14 +141,24 @@ def plan_caches(
 
 def _check_places(config: TrainConfig, sources: Sequence[tuple[Path, SourceConfig]]) -> None:
     """Raise ConfigError if a place is trained on and held out, or a member has nothing to train on."""
-    trained = {(folder / place.name).resolve() for folder, source in sources for place in source.places}
-    held_out = {(folder / name).resolve() for folder, source in sources for name in source.held_out}
-    if both := trained & held_out:
-        raise ConfigError(f"setting 'sources': {min(both).name} is held out and also trained on")
+    trained = [folder / place.name for folder, source in sources for place in source.places]
+    held_out = [folder / name for folder, source in sources for name in source.held_out]
+    if both := [path.name for path in held_out if any(_overlap(path, other) for other in trained)]:
+        raise ConfigError(f"setting 'sources': {min(both)} is held out and also trained on")
     depth = [source for source in config.sources if source.places and source.supervision != "gravity"]
     for member in range(config.members):
         if not any(_trains(source.members, member) for source in depth):
             raise ConfigError(f"setting 'sources': there is no place to train on for member {member}")
+
+
+def _overlap(one: Path, other: Path) -> bool:
+    """True if two places, each a folder or some numbers in it, have images in common."""
+    (folder, numbers), (other_folder, other_numbers) = split_numbers(one), split_numbers(other)
+    if folder.resolve() != other_folder.resolve():
+        return False
+    if numbers is None or other_numbers is None:
+        return True
+    return numbers[0] <= other_numbers[1] and other_numbers[0] <= numbers[1]
 
 
 def _with_partners(training: Sequence[PlannedCache]) -> list[PlannedCache]:

@@ -11,9 +11,10 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 from slamdepth.errors import DatasetError
 from slamdepth.registry import Registry
@@ -21,6 +22,8 @@ from slamdepth.types import Camera, Frame
 from slamdepth.typing import Floats
 
 logger = logging.getLogger(__name__)
+
+_NUMBERS = re.compile(r"(?P<name>.+)\[(?P<first>\d+)-(?P<last>\d+)\]")
 
 
 class Place(Protocol):
@@ -58,6 +61,19 @@ class Place(Protocol):
     def gravity(self, index: int) -> Floats | None:
         """Unit direction of gravity ``(3,)`` in the camera frame of image ``index``; None if the
         place does not record it."""
+        ...
+
+
+@runtime_checkable
+class NumberedPlace(Place, Protocol):
+    """A place whose images have numbers, of which a part can be taken."""
+
+    def between(self, first: int, last: int) -> Place:
+        """The images numbered ``first`` to ``last``, both included.
+
+        Raises:
+            DatasetError: there are none.
+        """
         ...
 
 
@@ -118,6 +134,8 @@ def open_place(
     """Open a folder of images with depth.
 
     Args:
+        folder: ``NAME`` or, for images with numbers, ``NAME[FIRST-LAST]``: these only. So the places that
+            one folder holds in the order of their numbers can be told apart.
         reader: name of the reader; None takes the first that matches the folder.
         more_readers: further readers, tried after those of this package.
 
@@ -128,6 +146,7 @@ def open_place(
     readers = {**known_readers(), **(more_readers or {})}
     if reader is not None and reader not in readers:
         raise DatasetError(f"unknown reader '{reader}' of training data; choose from: {', '.join(readers)}")
+    folder, numbers = split_numbers(folder)
     if not folder.is_dir():
         raise DatasetError(f"{folder}: no such folder")
     try:
@@ -136,12 +155,24 @@ def open_place(
             layouts = "; ".join(f"{name} ({known.needs})" for name, known in readers.items())
             raise DatasetError(f"{folder}: no known layout of training data; known are: {layouts}")
         place = readers[found].open(folder)
+        if numbers is not None:
+            if not isinstance(place, NumberedPlace):
+                raise DatasetError(f"{folder}: its images have no numbers, so no part of it can be named")
+            place = place.between(*numbers)
     except OSError as error:
         raise DatasetError(f"{folder}: cannot be read: {error.strerror or error}") from error
     logger.info("%s: %d images with depth, read as '%s'", folder, len(place), found)
     for note in place.notes:
         logger.info("%s: %s", place.name, note)
     return place
+
+
+def split_numbers(folder: Path) -> tuple[Path, tuple[int, int] | None]:
+    """``NAME[FIRST-LAST]`` as the folder NAME and the two numbers; None where it names a whole folder."""
+    named = _NUMBERS.fullmatch(folder.name)
+    if named is None or folder.is_dir():
+        return folder, None
+    return folder.with_name(named["name"]), (int(named["first"]), int(named["last"]))
 
 
 def data_folder(named: str) -> Path:

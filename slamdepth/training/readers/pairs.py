@@ -9,7 +9,7 @@ lines ``NNNNN x y z``, the pair's name and a unit vector in the camera frame (x 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +66,23 @@ class PairPlace:
     def fingerprint(self) -> str:
         known = (self.gravities,) if self.gravities else ()
         return fingerprint((*self.images, *self.depths), self.camera, self.depth_unit_m, *known)
+
+    def between(self, first: int, last: int) -> PairPlace:
+        """The pairs numbered ``first`` to ``last``, both included.
+
+        Raises:
+            DatasetError: there are none.
+        """
+        kept = [k for k, path in enumerate(self.images) if path.stem.isdigit() and first <= int(path.stem) <= last]
+        if not kept:
+            raise DatasetError(f"{self.images[0].parent}: no pair is numbered {first} to {last}")
+        return replace(
+            self,
+            name=f"{self.name}[{first}-{last}]",
+            images=tuple(self.images[k] for k in kept),
+            depths=tuple(self.depths[k] for k in kept),
+            gravities=tuple(self.gravities[k] for k in kept) if self.gravities else (),
+        )
 
     def read(self, index: int) -> Frame:
         """Image and depth of pair ``index``; see :meth:`slamdepth.training.data.Place.read`."""
