@@ -111,10 +111,10 @@ def test_a_head_that_reads_gravity_comes_back_from_its_file(tmp_path: Path) -> N
     save_head(tmp_path / "h.safetensors", model, {})
     loaded, about = load_head(tmp_path / "h.safetensors")
     assert loaded.shape == replace(SHAPE, members=2)
-    assert about["format"] == "slamdepth-depth-head-6"
+    assert about["format"] == "slamdepth-depth-head-7"
     field = fields((0.0, 0.8, 0.6), (0.6, 0.8, 0.0))[:, :, :6, :8]
     with torch.inference_mode():
-        log_depth, _ = loaded(*ARGS, field)
+        log_depth, _, _ = loaded(*ARGS, field)
         outs = [member(*ARGS, field)[:, 0] for member in loaded.members]
         assert float((log_depth - loaded(*ARGS)[0]).abs().max()) > 1e-4
     torch.testing.assert_close(log_depth, (outs[0] + outs[1]) / 2)

@@ -147,7 +147,7 @@ def test_head_shapes_for_any_aspect(rows: int, columns: int) -> None:
     tokens, cls = torch.randn(2, 2, 24, rows, columns), torch.randn(2, 2, 24)
     image = torch.randn(2, 3, 14 * rows, 14 * columns)
     with torch.inference_mode():
-        log_depth, sigma = head(tokens, cls, image)
+        log_depth, sigma, _ = head(tokens, cls, image)
     assert log_depth.shape == sigma.shape == (2, 14 * rows, 14 * columns)
     assert bool((sigma > 0).all())
 
@@ -172,7 +172,7 @@ def test_depth_is_the_mean_of_the_members_and_sigma_their_geometric_mean() -> No
     args = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56)
     with torch.inference_mode():
         outs = [member(*args) for member in model.members]
-        log_depth, sigma = model(*args)
+        log_depth, sigma, _ = model(*args)
     torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
     # the deviation of a Laplace distribution is the root of 2 times its spread
     spread = (outs[0][:, 1].exp() * outs[1][:, 1].exp()).sqrt()
@@ -209,7 +209,7 @@ def test_the_uncertainty_network_is_averaged_with_the_members_and_comes_back_fro
     save_head(tmp_path / "h.safetensors", model, {})
     loaded, _ = load_head(tmp_path / "h.safetensors")
     with torch.inference_mode():
-        log_depth, sigma = loaded(*args)
+        log_depth, sigma, _ = loaded(*args)
         outs = [member(*args) for member in loaded.members]
     torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
     spread = math.sqrt(0.5 * math.sqrt(0.2 * 0.05))
@@ -247,12 +247,12 @@ def test_scales_of_members_are_averaged_and_come_back_from_the_file(tmp_path: Pa
     args = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56)
     with torch.inference_mode():
         outs = [member(*args) for member in loaded.members]
-        log_depth, _ = loaded(*args)
+        log_depth, _, _ = loaded(*args)
     assert float(log_depth.mean()) == pytest.approx(math.log(2.0), abs=1e-3)
     torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
 
 
-@pytest.mark.parametrize("number", [1, 5, 7])
+@pytest.mark.parametrize("number", [1, 5, 8])
 def test_heads_of_other_formats_are_refused(tmp_path: Path, number: int) -> None:
     tensors = {name: value.half().contiguous() for name, value in HeadEnsemble(SMALL).state_dict().items()}
     shape = json.dumps({"taps": [0, 2], "doubt": 4, "level_dim": 4})

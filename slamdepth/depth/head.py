@@ -30,13 +30,16 @@ from slamdepth.depth.head_layers import (
     zeroed,
 )
 from slamdepth.depth.layout import check_layout, pack_about, unpack_about
+from slamdepth.depth.scale_uncertainty import ScaleUncertainty, scale_tap
 from slamdepth.depth.uncertainty import UncertaintyNet
 from slamdepth.errors import WeightsError
 
 UPSAMPLING = "weights."
 """Prefix of the parameters that only the upsampling to full resolution uses."""
 _FORMAT_NAME = "slamdepth-depth-head-"
-FORMAT = f"{_FORMAT_NAME}6"
+FORMAT = f"{_FORMAT_NAME}7"
+_ALSO_READ = f"{_FORMAT_NAME}6"
+"""The format before, which knows no uncertainty of the scale."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ class HeadShape:
         gravity: a gravity field is read (:func:`~slamdepth.depth.gravity_field.gravity_field`); needs
             ``scale_dim``.
         gravity_dim: channels of the network that estimates the direction of gravity; 0 where there is none.
+        subspace_dim: dimensions of the subspace of tokens of a
+            :class:`~slamdepth.depth.scale_uncertainty.ScaleUncertainty`; 0 where there is none.
     """
 
     taps: tuple[int, ...] = (5, 8, 11)
@@ -72,6 +77,7 @@ class HeadShape:
     input_px: int = 238 * 322
     gravity: bool = False
     gravity_dim: int = 0
+    subspace_dim: int = 0
 
 
 class DepthHead(nn.Module):
@@ -189,14 +195,22 @@ class HeadEnsemble(nn.Module):
         self.uncertainty: UncertaintyNet | None = (
             UncertaintyNet(shape.token_dim, shape.uncertainty_dim) if shape.uncertainty_dim else None
         )
+        self.scale: ScaleUncertainty | None = (
+            ScaleUncertainty(shape.token_dim, shape.subspace_dim) if shape.subspace_dim else None
+        )
         width = len(shape.taps) * shape.token_dim
         self.gravity: GravityScorer | None = (
             GravityScorer(width, shape.gravity_dim) if shape.gravity_dim else None
         )
 
     def forward(
-        self, tokens: Tensor, class_tokens: Tensor, image: Tensor, field: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+        self,
+        tokens: Tensor,
+        class_tokens: Tensor,
+        image: Tensor,
+        field: Tensor | None = None,
+        focal_px: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """The mean prediction at full resolution.
 
         Args:
@@ -204,13 +218,21 @@ class HeadEnsemble(nn.Module):
             class_tokens: ``(B, taps, dim)``.
             image: ``(B, 3, H, W)``, ImageNet-normalised.
             field: gravity field ``(B, 4, H/7, W/7)``, 0 where gravity is unknown; None: unknown for all.
+            focal_px: ``(B,)`` focal length in pixels of ``image``; None: one that was trained.
 
         Returns:
             Natural logarithm of the canonical depth and its calibrated standard deviation, both
-            ``(B, H, W)``.
+            ``(B, H, W)``; and that of the scale error that an image has in common, ``(B,)``, infinite where
+            the image is unlike the training; None where no uncertainty was fitted to left-out places.
         """
         members = cast("list[DepthHead]", list(self.members))
         predicted = [member.coarse(tokens, class_tokens, image, field) for member in members]
+        scale_sigma = None
+        if self.scale is not None:
+            own = torch.stack([coarse[:, 1] for coarse, _ in predicted]).mean(dim=0)
+            log_focal = self.scale.focal.mean().expand(len(own)) if focal_px is None else focal_px.log()
+            distance = self.scale.distance(tokens[:, scale_tap(tokens.shape[1])])
+            scale_sigma = self.scale(distance, own.mean(dim=(1, 2)), log_focal)
         if self.uncertainty is not None:
             log_depth, own = torch.stack([coarse for coarse, _ in predicted]).mean(dim=0).unbind(dim=1)
             sine = torch.zeros_like(own) if field is None else field[:, 0]
@@ -223,7 +245,8 @@ class HeadEnsemble(nn.Module):
             for member, (coarse, features) in zip(members, predicted, strict=True)
         ])  # fmt: skip
         # A Laplace distribution of spread b has the variance 2 b^2.
-        return outs[:, :, 0].mean(dim=0), self.sigma_scale * math.sqrt(2.0) * outs[:, :, 1].mean(dim=0).exp()
+        sigma = self.sigma_scale * math.sqrt(2.0) * outs[:, :, 1].mean(dim=0).exp()
+        return outs[:, :, 0].mean(dim=0), sigma, scale_sigma
 
 
 def save_head(path: Path, model: HeadEnsemble, about: dict[str, str]) -> None:
@@ -272,7 +295,7 @@ def load_head(path: Path, device: str = "cpu") -> tuple[HeadEnsemble, dict[str, 
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file: {error}") from error
-    if (kind := meta.get("format", "")) != FORMAT:
+    if (kind := meta.get("format", "")) not in (FORMAT, _ALSO_READ):
         if kind.startswith(_FORMAT_NAME):
             raise WeightsError(
                 f"{path}: a head of another version of slamdepth ({kind}, not {FORMAT}); train it again with "

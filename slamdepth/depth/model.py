@@ -194,7 +194,10 @@ class Dinov2Depth:
                 field = gravity_field(
                     direction, torch.tensor([image.focal_px], device=self.device), *image.size
                 )
-            log_depth, sigma = self._head(image.tokens, encoded.class_tokens, encoded.pixels, field)
+            focal_px = torch.tensor([image.focal_px], device=self.device)
+            log_depth, sigma, scale_sigma = self._head(
+                image.tokens, encoded.class_tokens, encoded.pixels, field, focal_px
+            )
             both = torch.stack([log_depth, sigma], dim=1)
             size = encoded.frame.image_rgb.shape[:2]
             full = F.interpolate(both, size=size, mode="bilinear", align_corners=False)[0]
@@ -205,6 +208,7 @@ class Dinov2Depth:
             np.ascontiguousarray(values, dtype=np.float32),
             self.kind,
             np.ascontiguousarray(sigma_log, dtype=np.float32),
+            scale_sigma_log=None if scale_sigma is None else float(scale_sigma[0]),
         )
 
 

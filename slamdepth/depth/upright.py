@@ -70,7 +70,7 @@ def rotated_back(
     if upright.sigma_log is not None and sigma is not None:
         taken, rotated_sigma = sigma.astype(np.float64), _back(upright.sigma_log, camera, roll_rad)
         sigma = (taken + share * inside * (rotated_sigma - taken)).astype(np.float32)
-    return replace(as_taken, values=values, sigma_log=sigma)
+    return replace(as_taken, values=values, sigma_log=sigma, scale_sigma_log=upright.scale_sigma_log)
 
 
 def _spread(difference: Floats, known: Bools) -> Floats:

@@ -33,7 +33,7 @@ def judge(ensemble: HeadEnsemble, cache: FeatureCache, device: str) -> tuple[dic
     for k in range(len(cache)):
         batch = load_batch(cache, np.array([k]), device)
         with torch.inference_mode():
-            log_depth, sigma = ensemble(*batch[:4])
+            log_depth, sigma, _ = ensemble(*batch[:4])
         known = batch[4][0] > 0
         if int(known.sum()) < _MIN_PIXELS:
             continue
@@ -131,7 +131,7 @@ def _sample_view(
 ) -> SampleView:
     batch = load_batch(cache, np.array([k]), device)
     with torch.inference_mode():
-        log_depth, sigma = ensemble(*batch[:4])
+        log_depth, sigma, _ = ensemble(*batch[:4])
     factor = float(cache.focal_factor[k])
     return SampleView(
         planned.places[int(cache.place[k])].name,

@@ -73,7 +73,9 @@ class PairPlace:
         Raises:
             DatasetError: there are none.
         """
-        kept = [k for k, path in enumerate(self.images) if path.stem.isdigit() and first <= int(path.stem) <= last]
+        kept = [
+            k for k, path in enumerate(self.images) if path.stem.isdigit() and first <= int(path.stem) <= last
+        ]
         if not kept:
             raise DatasetError(f"{self.images[0].parent}: no pair is numbered {first} to {last}")
         return replace(
