@@ -187,7 +187,8 @@ def test_a_plan_counts_the_time_of_every_fit(
 def outputs(head: Any) -> tuple[torch.Tensor, torch.Tensor]:
     torch.manual_seed(0)
     with torch.inference_mode():
-        log_depth, sigma = head(torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56))
+        inputs = torch.randn(1, 2, 24, 3, 4), torch.randn(1, 2, 24), torch.randn(1, 3, 42, 56)
+        log_depth, sigma, _ = head(*inputs)
     return log_depth, sigma
 
 

@@ -362,3 +362,29 @@ def test_the_same_place_is_never_both_trained_on_and_held_out(tmp_path: Path) ->
     (tmp_path / "link").symlink_to(tmp_path / "room")
     with pytest.raises(ConfigError, match="room is held out and also trained on"):
         plan_caches(source_config(tmp_path, places=[{"name": "room"}], held_out=["link"]), "given")
+
+
+def test_a_part_of_the_numbered_pairs_is_a_place_of_its_own(tmp_path: Path) -> None:
+    make_place(tmp_path / "halls", 6)
+    part = open_place(tmp_path / "halls[2-4]")
+    assert (part.name, len(part)) == ("halls[2-4]", 3)
+    whole = open_place(tmp_path / "halls")
+    np.testing.assert_array_equal(part.read(0).image_rgb, whole.read(2).image_rgb)
+    assert part.fingerprint != whole.fingerprint
+    with pytest.raises(DatasetError, match="no pair is numbered 7 to 9"):
+        open_place(tmp_path / "halls[7-9]")
+
+
+def test_parts_that_overlap_are_not_both_trained_on_and_held_out(tmp_path: Path) -> None:
+    make_place(tmp_path / "halls", 6)
+
+    def planned(held_out: str) -> int:
+        places = [{"name": "halls[0-2]", "samples": 2}]
+        source = {"folder": str(tmp_path), "places": places, "held_out": [held_out]}
+        config = TrainConfig.from_dict({"output": "head.safetensors", "sources": [source]})
+        return len(plan_caches(config, "test"))
+
+    assert planned("halls[3-5]") == 2
+    for overlapping in ("halls[2-4]", "halls"):
+        with pytest.raises(ConfigError, match="is held out and also trained on"):
+            planned(overlapping)

@@ -143,7 +143,7 @@ def _check_places(config: TrainConfig, sources: Sequence[tuple[Path, SourceConfi
     """Raise ConfigError if a place is trained on and held out, or a member has nothing to train on."""
     trained = [folder / place.name for folder, source in sources for place in source.places]
     held_out = [folder / name for folder, source in sources for name in source.held_out]
-    if both := [path.name for path in held_out if any(_overlap(path, other) for other in trained)]:
+    if both := [path.name for path in trained if any(_overlap(path, other) for other in held_out)]:
         raise ConfigError(f"setting 'sources': {min(both)} is held out and also trained on")
     depth = [source for source in config.sources if source.places and source.supervision != "gravity"]
     for member in range(config.members):
