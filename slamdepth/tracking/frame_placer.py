@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +13,7 @@ from slamdepth.geometry import orthonormalised
 from slamdepth.loops.look_alikes import Reach
 from slamdepth.mapping.map_keyframe import AnchoredPose
 from slamdepth.mapping.placement import PlacedBy, Placement
-from slamdepth.stopwatch import Stopwatch
-from slamdepth.tracking.map_parts import MapParts
+from slamdepth.tracking.map_parts import MapParts, RunParts
 from slamdepth.tracking.pose_check import Verdict
 from slamdepth.types import Frame
 from slamdepth.typing import Floats
@@ -46,14 +44,13 @@ class FramePlacer:
 
     Args:
         parts: of the map.
-        watch: measures ``tracking``.
-        wide_features: finds more features of a frame, for a search over a wide baseline.
+        run: what it shares with other maps.
     """
 
-    def __init__(self, parts: MapParts, watch: Stopwatch, wide_features: Callable[[Frame], Features]) -> None:
+    def __init__(self, parts: MapParts, run: RunParts) -> None:
         self._parts = parts
-        self._watch = watch
-        self._wide_features = wide_features
+        self._watch = run.watch
+        self._wide_features = run.wide_features
 
     def place(self, frame: Frame, raw: Features) -> Found | None:
         """Place a frame in the map; None where the camera is lost, and its motion forgotten."""

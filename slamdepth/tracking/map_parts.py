@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from slamdepth.config import Config
-from slamdepth.frontend.features import ScaleLevels
+from slamdepth.frontend.features import Features, ScaleLevels
 from slamdepth.mapping.map import Map
 from slamdepth.mapping.placement import PlacedBy
 from slamdepth.stopwatch import Stopwatch
@@ -18,7 +20,28 @@ from slamdepth.tracking.pose_check import PoseCheck
 from slamdepth.tracking.relocaliser import Relocaliser
 from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.tracking.workers import Workers
-from slamdepth.types import Camera
+from slamdepth.types import Camera, Frame
+
+
+@dataclass(frozen=True)
+class RunParts:
+    """What the maps of a run share.
+
+    Attributes:
+        camera: that took the frames.
+        config: settings of the run.
+        levels: pyramid levels of the extractor.
+        workers: threads, and the depth model.
+        watch: measures where the time goes.
+        wide_features: finds more features of a frame, for a search over a wide baseline.
+    """
+
+    camera: Camera
+    config: Config
+    levels: ScaleLevels
+    workers: Workers
+    watch: Stopwatch
+    wide_features: Callable[[Frame], Features]
 
 
 class MapParts:
@@ -26,8 +49,7 @@ class MapParts:
 
     Args:
         id_: number of the map in its run.
-        levels: pyramid levels of the extractor.
-        workers, watch: shared by the maps of a run.
+        run: what it shares with other maps.
 
     Attributes:
         id: number of the map, from 0 in the order of their start.
@@ -35,24 +57,15 @@ class MapParts:
         placed_by: how many frames were placed by what.
     """
 
-    def __init__(
-        self,
-        id_: int,
-        camera: Camera,
-        config: Config,
-        levels: ScaleLevels,
-        workers: Workers,
-        watch: Stopwatch,
-    ) -> None:
+    def __init__(self, id_: int, run: RunParts) -> None:
+        camera, config, workers = run.camera, run.config, run.workers
         self.id = id_
-        self._config = config
-        self._workers = workers
-        self._watch = watch
+        self._run = run
         self.map = Map(config.map.keyframe_memory_mib)
         self.frames = FrameLog(camera, self.map)
         self.motion = MotionModel()
         self.shutter = RollingShutter(camera, config.shutter, self.map)
-        self.localiser = Localiser(camera, config, self.map, levels)
+        self.localiser = Localiser(camera, config, self.map, run.levels)
         self.check = PoseCheck(camera, self.map, self.localiser)
         self.view_change = self.localiser.view_change
         self.integration = KeyframeIntegration(
@@ -63,7 +76,7 @@ class MapParts:
             self.frames,
             self.shutter,
             workers,
-            watch,
+            run.watch,
         )
         self.relocaliser = Relocaliser(
             camera,

@@ -4,22 +4,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from slamdepth.config import Config
-from slamdepth.frontend.features import Features, ScaleLevels
+from slamdepth.frontend.features import Features
 from slamdepth.geometry import Similarity
 from slamdepth.loops.meeting import Meeting
 from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.placement import PlacedBy, Placement
-from slamdepth.stopwatch import Stopwatch
 from slamdepth.tracking.frame_placer import Found, FramePlacer
-from slamdepth.tracking.map_parts import MapParts
-from slamdepth.tracking.workers import Workers
-from slamdepth.types import Camera, Frame
+from slamdepth.tracking.map_parts import MapParts, RunParts
+from slamdepth.types import Frame
 from slamdepth.typing import Floats
 
 log = logging.getLogger(__name__)
@@ -51,31 +48,19 @@ class MapTracker(MapParts):
 
     Args:
         id_: number of the map in its run.
-        levels: pyramid levels of the extractor.
-        workers, watch: shared by the maps of a run.
-        wide_features: finds more features of a frame, for a search over a wide baseline.
+        run: what it shares with other maps.
     """
 
-    def __init__(
-        self,
-        id_: int,
-        camera: Camera,
-        config: Config,
-        levels: ScaleLevels,
-        workers: Workers,
-        watch: Stopwatch,
-        wide_features: Callable[[Frame], Features],
-    ) -> None:
-        super().__init__(id_, camera, config, levels, workers, watch)
-        self._wide_features = wide_features
-        self._placer = FramePlacer(self, watch, wide_features)
+    def __init__(self, id_: int, run: RunParts) -> None:
+        super().__init__(id_, run)
+        self._placer = FramePlacer(self, run)
 
     def start(self, frame: Frame, features: Features) -> Placed | None:
         """Start the map with a frame; None where its depth does not create enough landmarks."""
         if self.view_change.is_large:
-            features = self._wide_features(frame)
-        need = self._config.tracking.min_inliers
-        depth = self._workers.depth
+            features = self._run.wide_features(frame)
+        need = self._run.config.tracking.min_inliers
+        depth = self._run.workers.depth
         if len(features) < need or not depth.has_depth(frame):
             return None
         if self.integration.mapper.count_creatable(features, depth.take(frame)) < need:
@@ -146,7 +131,7 @@ class MapTracker(MapParts):
         follows_motion = self.motion.is_known
         if placement.is_loose and self.integration.awaits_landmarks:
             placement = self._placer.place_in_grown_map(features, placement)
-        is_keyframe = self.integration.wants(placement) and self._workers.depth.has_depth(frame)
+        is_keyframe = self.integration.wants(placement) and self._run.workers.depth.has_depth(frame)
         is_keyframe &= not self.check.is_provisional
         if is_keyframe and self.integration.is_full:
             placement = self._placer.place_in_grown_map(features, placement)
@@ -176,9 +161,9 @@ class MapTracker(MapParts):
         *,
         is_keyframe: bool,
     ) -> Placed:
-        with self._watch.timed("uncertainty"):
+        with self._run.watch.timed("uncertainty"):
             covariance, quality = self.check.uncertainty(frame.timestamp_s, features, placement)
-        with self._watch.timed("moving"):
+        with self._run.watch.timed("moving"):
             is_near = not self.view_change.is_large
             moving = self.check.moving(frame.timestamp_s, features, placement, is_judged=is_near)
         return Placed(placement, placed_by, is_keyframe, covariance, quality, moving)

@@ -21,6 +21,7 @@ from slamdepth.thread_limits import single_threaded
 from slamdepth.tracking.atlas import Atlas
 from slamdepth.tracking.finish import finish_run
 from slamdepth.tracking.frame_log import check_frame
+from slamdepth.tracking.map_parts import RunParts
 from slamdepth.tracking.map_tracker import MapTracker, Placed
 from slamdepth.tracking.workers import DepthWorker, Workers
 from slamdepth.types import Camera, Frame, StepResult, TrackingStatus
@@ -74,9 +75,8 @@ class Tracker:
 
     def _new_map(self, id_: int) -> MapTracker:
         levels = self._prepare.levels
-        return MapTracker(
-            id_, self.camera, self.config, levels, self._workers, self._watch, self._wide_features
-        )
+        run = RunParts(self.camera, self.config, levels, self._workers, self._watch, self._wide_features)
+        return MapTracker(id_, run)
 
     @property
     def _active(self) -> MapTracker:
