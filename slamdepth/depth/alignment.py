@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.errors import TrackingError
+from slamdepth.robust import robust_deviation
 from slamdepth.types import DepthKind, DepthPrediction
 from slamdepth.typing import Floats
 
@@ -231,7 +232,7 @@ def fit_depth_field(
     good = np.isfinite(ratio) & np.isfinite(sigma) & np.isfinite(sigma_map)
     if np.count_nonzero(good) >= 8:
         median = np.median(ratio[good])
-        spread = 1.4826 * np.median(np.abs(ratio[good] - median)) + 0.02
+        spread = robust_deviation(ratio[good], median) + 0.02
         good &= np.abs(ratio - median) < 3.5 * spread
     index = np.flatnonzero(good)
     if len(index) > MAX_ANCHORS:

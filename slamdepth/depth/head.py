@@ -227,16 +227,15 @@ class HeadEnsemble(nn.Module):
         """
         members = cast("list[DepthHead]", list(self.members))
         predicted = [member.coarse(tokens, class_tokens, image, field) for member in members]
+        mean_log_depth, own = torch.stack([coarse for coarse, _ in predicted]).mean(dim=0).unbind(dim=1)
         scale_sigma = None
         if self.scale is not None:
-            own = torch.stack([coarse[:, 1] for coarse, _ in predicted]).mean(dim=0)
             log_focal = self.scale.focal.mean().expand(len(own)) if focal_px is None else focal_px.log()
             distance = self.scale.distance(tokens[:, scale_tap(tokens.shape[1])])
             scale_sigma = self.scale(distance, own.mean(dim=(1, 2)), log_focal)
         if self.uncertainty is not None:
-            log_depth, own = torch.stack([coarse for coarse, _ in predicted]).mean(dim=0).unbind(dim=1)
             sine = torch.zeros_like(own) if field is None else field[:, 0]
-            log_spread = self.uncertainty(tokens[:, -1], log_depth, own, sine)
+            log_spread = self.uncertainty(tokens[:, -1], mean_log_depth, own, sine)
             predicted = [
                 (torch.stack([coarse[:, 0], log_spread], dim=1), features) for coarse, features in predicted
             ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slamdepth.robust import robust_deviation
 from slamdepth.typing import Floats
 
 _TUKEY = 4.685  # 95 % efficiency for Gaussian errors
@@ -44,7 +45,7 @@ def robust_line(
     if start is None or spread is None:
         line = _least_median(design, y, lowest)
         residual, _ = _residual(design, y, line, lowest)
-        spread = max(1.4826 * float(np.median(np.abs(residual))), _MIN_SPREAD)
+        spread = max(robust_deviation(residual, 0.0), _MIN_SPREAD)
     else:
         line = np.array(start)
     for _ in range(20):

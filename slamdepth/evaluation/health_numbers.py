@@ -12,6 +12,7 @@ from slamdepth.evaluation.health_facts import RunFacts
 from slamdepth.evaluation.health_odometry import correction_share, weakest_second
 from slamdepth.evaluation.health_spans import HealthSpan, SpanKind, largest_moving_share
 from slamdepth.evaluation.leaps import judged_steps
+from slamdepth.robust import robust_deviation
 from slamdepth.types import StepResult, TrackingStatus
 
 
@@ -101,7 +102,7 @@ def measure_health(facts: RunFacts, spans: Sequence[HealthSpan], leaps: int) -> 
         frames_per_keyframe=len(inside) / keyframes if keyframes else None,
         loop_closures=run.loop_closures,
         loops_refused=run.loops_refused,
-        scale_spread_log=1.4826 * float(np.median(np.abs(votes - np.median(votes)))) if len(votes) else None,
+        scale_spread_log=robust_deviation(votes) if len(votes) else None,
         weakest_second=weakest_second(facts),
         correction_share=correction_share(facts),
         maps=1 + len(facts.others),

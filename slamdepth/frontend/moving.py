@@ -8,7 +8,7 @@ import numpy as np
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.matching import best_matches
 from slamdepth.frontend.pose import CELLS, cells_of
-from slamdepth.geometry import transform
+from slamdepth.geometry import backproject, transform
 from slamdepth.types import Camera
 from slamdepth.typing import Floats, Ints
 
@@ -103,9 +103,7 @@ def _off_line(camera: Camera, px_before: Floats, px_now: Floats, T: Floats, dist
 
 def _seen_at(camera: Camera, px: Floats, T: Floats, depth: float) -> Floats:
     """Pixels ``(N, 2)`` after a motion ``(4, 4)`` of points at one depth; infinity leaves the rotation."""
-    rays = np.column_stack(
-        [(px[:, 0] - camera.cx) / camera.fx, (px[:, 1] - camera.cy) / camera.fy, np.ones(len(px))]
-    )
+    rays = backproject(camera, px, np.ones(len(px)))
     moved = rays @ T[:3, :3].T if np.isinf(depth) else transform(T, depth * rays)
     z = np.maximum(moved[:, 2], 1e-3)
     return np.column_stack([camera.fx * moved[:, 0] / z + camera.cx, camera.fy * moved[:, 1] / z + camera.cy])

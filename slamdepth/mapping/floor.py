@@ -20,6 +20,7 @@ import numpy as np
 
 from slamdepth.mapping.floor_points import FloorPoints, dense_points, landmarks, observations
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.robust import robust_deviation
 from slamdepth.typing import Floats, Ints
 
 MAX_TILT_DEG = 35.0
@@ -188,7 +189,7 @@ def _mounted(reconstruction: Reconstruction, rows: Ints, owner: Ints, gravity_w:
         return None
     heights, tilts, shares = np.array(found).T
     centre = float(np.median(np.log(heights)))
-    spread = 1.4826 * float(np.median(np.abs(np.log(heights) - centre)))
+    spread = robust_deviation(np.log(heights), centre)
     if spread > _KEPT_HEIGHT:
         return None
     independent = len(found) / len(windows) * count / (2 * _NEIGHBOURS + 1)  # neighbours share their points

@@ -13,6 +13,7 @@ from slamdepth.mapping.fusion_depth import View, trusted_depth
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapping.tsdf import undistorted_depth
+from slamdepth.robust import robust_deviation
 from slamdepth.typing import Bools, Floats, Floats32, Ints
 
 _MIN_PARALLAX_RAD = math.radians(2.0)
@@ -119,7 +120,7 @@ def dense_points(
         ratio = np.concatenate(off)
         if len(ratio) < _FEWEST_JUDGES:
             return None
-        if 1.4826 * float(np.median(np.abs(ratio - np.median(ratio)))) > _AGREES:
+        if robust_deviation(ratio) > _AGREES:
             return None
     counts = [len(some) for some in points]
     return FloorPoints(np.concatenate(points), np.repeat(chosen, counts), centres)

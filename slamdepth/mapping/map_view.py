@@ -14,6 +14,14 @@ from slamdepth.mapping.map_keyframe import KeyframeState, MapKeyframe, read_only
 from slamdepth.typing import Floats, Ints
 
 NEAREST_M = 0.05
+
+
+def median_depth_m(T_camera_world: Floats, points_w: Floats) -> float:
+    """Median depth of points ``(N, 3)``, at least one, seen by a camera ``(4, 4)``; at least 0.05 m."""
+    depths = np.sort(points_w @ T_camera_world[2, :3] + T_camera_world[2, 3])
+    return max(float(depths[len(depths) // 2]), NEAREST_M)
+
+
 """Landmarks nearer to a camera, or behind it, are not seen by it."""
 
 _INITIAL_CAPACITY = 4096

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamdepth.geometry import so3_exp
+from slamdepth.robust import robust_deviation
 from slamdepth.types import Camera
 from slamdepth.typing import Floats, Ints
 
@@ -103,7 +104,7 @@ def fit_marker(camera: Camera, sightings: Sequence[Sighting]) -> MarkerFit | Non
         sigma_log=_sigma(found.jac, off, groups),
         centre=centre + found.x[3:6] * side,
         parallax_deg=_parallax_deg(centre + found.x[3:6] * side, sightings),
-        residual_px=1.4826 * float(np.median(np.abs(off))),
+        residual_px=robust_deviation(off, 0.0),
     )
 
 
@@ -149,7 +150,7 @@ def _sigma(J: Floats, off: Floats, groups: Ints) -> float:
     count = len(scores)
     clustered = covariance @ (scores.T @ scores) @ covariance * (count / max(1, count - 1))
     rows = len(off) / count / 4.0  # of each group, four rows count as independent
-    by_pixels = covariance * max(_SIGMA_PX, 1.4826 * float(np.median(np.abs(off)))) ** 2 * rows
+    by_pixels = covariance * max(_SIGMA_PX, robust_deviation(off, 0.0)) ** 2 * rows
     return math.sqrt(max(float(clustered[6, 6]), float(by_pixels[6, 6]), 1e-12))
 
 

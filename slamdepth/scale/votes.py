@@ -21,6 +21,7 @@ import numpy as np
 
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.robust import robust_deviation
 from slamdepth.types import DepthKind
 from slamdepth.typing import Floats
 
@@ -76,7 +77,7 @@ def robust_spread(values: Floats) -> float:
     """Standard deviation ``(N,)`` from the median absolute deviation; of fewer than five, the plain one."""
     if len(values) < 5:
         return float(np.std(values))
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    return robust_deviation(values)
 
 
 def independent_values(values: Floats) -> float:

@@ -14,6 +14,7 @@ from slamdepth.depth.alignment import DepthField, fit_depth_field, log_depth_at,
 from slamdepth.frontend.features import Features
 from slamdepth.geometry import backproject, transform
 from slamdepth.mapping.map import Map, MapKeyframe
+from slamdepth.robust import robust_deviation
 from slamdepth.tracking.localiser import Localiser
 from slamdepth.types import Camera, DepthPrediction
 from slamdepth.typing import Bools, Floats
@@ -110,7 +111,7 @@ class LocalMapper:
         ratio = ratio[np.isfinite(ratio)]
         if len(ratio) < _MIN_JUDGES:
             return True
-        scatter = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
+        scatter = robust_deviation(ratio)
         return scatter < _DISAGREES * float(np.median(sigma))
 
     def depth_field(self, keyframe: MapKeyframe, prediction: DepthPrediction) -> DepthField:

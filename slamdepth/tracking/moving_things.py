@@ -8,7 +8,7 @@ import numpy as np
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.moving import moving_share
 from slamdepth.geometry import invert
-from slamdepth.mapping.map_view import NEAREST_M, MapView
+from slamdepth.mapping.map_view import MapView, median_depth_m
 from slamdepth.mapping.placement import Placement
 from slamdepth.types import Camera
 from slamdepth.typing import Floats, Ints
@@ -70,7 +70,6 @@ class MovingThings:
         found, T_now = placement.found_ids, placement.T_camera_world
         if len(found) == 0:
             return None
-        depths = np.sort(self._map.landmarks.position_w[found] @ T_now[2, :3] + T_now[2, 3])
         ids_before = self._map.resolve(ids_before)
         is_seen_again = self._map.mask(placement.landmark_ids)
         static = np.flatnonzero(self._map.mask(ids_before)[placement.landmark_ids])
@@ -82,5 +81,5 @@ class MovingThings:
             np.flatnonzero(placement.landmark_ids < 0),
             now.px[static],
             T_now @ invert(T_before),
-            max(float(depths[len(depths) // 2]), NEAREST_M),
+            median_depth_m(T_now, self._map.landmarks.position_w[found]),
         )

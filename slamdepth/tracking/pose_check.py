@@ -12,7 +12,7 @@ import numpy as np
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.pose import cells_of, pose_covariance
 from slamdepth.geometry import CHI2_2DOF_95
-from slamdepth.mapping.map_view import NEAREST_M, MapView
+from slamdepth.mapping.map_view import MapView, median_depth_m
 from slamdepth.mapping.placement import PlacedBy, Placement
 from slamdepth.tracking.localiser import FARTHEST_PX, POSE_PX, Localiser
 from slamdepth.tracking.moving_things import MovingThings
@@ -149,10 +149,7 @@ class PoseCheck:
         ids = placement.found_ids[::_EVERY]
         if len(ids) == 0:
             return math.inf
-        points_w = self._map.landmarks.position_w[ids]
-        T = placement.T_camera_world
-        depths = np.sort(points_w @ T[2, :3] + T[2, 3])
-        return max(float(depths[len(depths) // 2]), NEAREST_M)
+        return median_depth_m(placement.T_camera_world, self._map.landmarks.position_w[ids])
 
     def _unearned(self, features: Features, placement: Placement) -> str:
         """Why the matches do not support the pose; empty where they do."""

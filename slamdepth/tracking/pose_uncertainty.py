@@ -9,7 +9,7 @@ import numpy as np
 
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.pose import pose_covariance
-from slamdepth.mapping.map_view import NEAREST_M, MapView
+from slamdepth.mapping.map_view import MapView, median_depth_m
 from slamdepth.mapping.placement import Placement
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
@@ -82,8 +82,7 @@ class PoseUncertainty:
         )
         if covariance is None:
             return None, 0.0
-        depths = np.sort(points_w @ T[2, :3] + T[2, 3])
-        distance = max(float(depths[len(depths) // 2]), NEAREST_M)
+        distance = median_depth_m(T, points_w)
         if before is not None and timestamp_s - before[0] <= _MAX_GAP_S:
             turn, length = (
                 _MOTION_S / (timestamp_s - before[0]) * of_step for of_step in motion_between(before[1], T)
