@@ -185,18 +185,22 @@ def _draw(
     judged: Mapping[str, DepthJudgement],
     sheet: Sequence[SheetRow],
 ) -> list[str]:
-    """Draw a plot of all data sets so far and a contact sheet of ``name``, next to the JSON file.
+    """Draw plots of all data sets so far and a contact sheet of ``name``, next to the JSON file.
 
     Returns:
         The names of the image files.
     """
     from slamdepth.report.depth import write_over_depth, write_sheet
+    from slamdepth.report.depth_calibration import write_calibration
     from slamdepth.types import DepthKind
 
     images = [output.with_name(f"{output.stem}_over_depth.png")]
     write_over_depth(images[0], judged, model.name)
+    calibration = output.with_name(f"{output.stem}_calibration.png")
+    if write_calibration(calibration, judged, model.name):
+        images.append(calibration)
     if sheet:
         scaled = f"after each frame's {'median' if model.kind is DepthKind.METRIC else 'affine fit'}"
         images.append(output.with_name(f"{output.stem}_{name}.png"))
-        write_sheet(images[1], sheet, scaled, f"{model.name} on {name}")
+        write_sheet(images[-1], sheet, scaled, f"{model.name} on {name}")
     return [image.name for image in images]

@@ -16,6 +16,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.evaluation.bootstrap import Interval, interval, spread
+from slamdepth.evaluation.calibration import Coverage, coverage_of, observed
 from slamdepth.evaluation.depth import depth_errors
 from slamdepth.evaluation.depth_fit import affine_fit, apply_affine, fits_in
 from slamdepth.evaluation.depth_maps import EdgeScore, depth_ssim, edge_score
@@ -71,6 +72,10 @@ class DepthJudgement:
             of them, after scaling by the frame's median; 1 where sigma is uninformative. None without sigma.
         within_one_sigma: share of pixels whose log error, as predicted, is below sigma; 0.68
             where sigma is calibrated. None without sigma or metres.
+        pixel_coverage: calibration curve of sigma, after scaling by the frame's median; each frame counts
+            the same. None without sigma.
+        scale_coverage: calibration curve of the scale of an image. None where the model does not say how
+            sure it is of the scale, or is not metric.
         over_depth: errors by depth.
         frames: number compared. pixels: of the errors, after subsampling.
         coverage: share of the sensor's pixels that have a prediction.
@@ -85,6 +90,8 @@ class DepthJudgement:
     scale_spread: Interval
     surest_half: Interval | None
     within_one_sigma: Interval | None
+    pixel_coverage: Coverage | None
+    scale_coverage: Coverage | None
     over_depth: OverDepth
     frames: int
     pixels: int
@@ -125,6 +132,8 @@ class DepthJudge:
         self._waiting: IO[bytes] = tempfile.SpooledTemporaryFile(max_size=_IN_MEMORY_BYTES)  # noqa: SIM115
         self._ratios: list[NDArray[np.float32]] = []
         self._uncertainties: list[dict[str, float]] = []
+        self._pixel_coverages: list[Floats] = []
+        self._scale_sigmas: list[float] = []
 
     @property
     def frames(self) -> int:
@@ -151,6 +160,13 @@ class DepthJudge:
             return False
         self._ratios.append(found.ratios.astype(np.float32))
         self._uncertainties.append(_uncertainty(found, prediction.sigma_log, self.kind is DepthKind.METRIC))
+        if prediction.sigma_log is not None:
+            error = np.log(found.depth / found.sensor_m)
+            self._pixel_coverages.append(
+                observed(error - np.median(error), prediction.sigma_log[found.where].astype(np.float64))
+            )
+        if prediction.scale_sigma_log is not None:
+            self._scale_sigmas.append(prediction.scale_sigma_log)
         for array in (as_depth(prediction.values, self.kind), self._compared.in_range(sensor_m)):
             np.save(self._waiting, array.astype(np.float32))
         return True
@@ -184,12 +200,25 @@ class DepthJudge:
             scale_spread=interval(columns["log_factor"], spread),
             surest_half=_optional(columns, "surest_half"),
             within_one_sigma=_optional(columns, "within_one_sigma"),
+            pixel_coverage=self._pixel_coverage(),
+            scale_coverage=self._scale_coverage(),
             over_depth=bins.result(),
             frames=self.frames,
             pixels=self._compared.pixels,
             coverage=self._compared.coverage,
             per_frame={name: tuple(column.tolist()) for name, column in columns.items()},
         )
+
+    def _pixel_coverage(self) -> Coverage | None:
+        if len(self._pixel_coverages) < self.frames:
+            return None
+        mean = np.mean(self._pixel_coverages, axis=0)
+        return Coverage(tuple(mean.tolist()), 1.0, self._compared.pixels)
+
+    def _scale_coverage(self) -> Coverage | None:
+        if self.kind is not DepthKind.METRIC or len(self._scale_sigmas) < self.frames:
+            return None
+        return coverage_of(np.array(self._compared.log_factors), np.array(self._scale_sigmas))
 
     def _scaled(
         self, depth: Floats, sensor: Floats, factor: float, log_factor: float

@@ -14,6 +14,7 @@ import numpy as np
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.card import card_of
 from slamdepth.evaluation import DepthJudgement, Interval
+from slamdepth.evaluation.calibration import EXPECTED, Coverage
 from slamdepth.report.figure import new_figure, write_png
 from slamdepth.report.keyframe_images import UNKNOWN, near_to_far
 from slamdepth.report.text import MISSING, percent
@@ -119,7 +120,17 @@ def judgement_lines(judgement: DepthJudgement) -> list[str]:
             f"AbsRel of the surest half over that of all: {with_half(judgement.surest_half)}; "
             f"errors within one sigma: {with_half(judgement.within_one_sigma)} (0.683 if calibrated)"
         )
+    if judgement.scale_coverage is not None:
+        lines.append(_scale_line(judgement.scale_coverage))
     return lines
+
+
+def _scale_line(curve: Coverage) -> str:
+    if not curve.known:
+        return "scale of every frame: unknown, the images do not look like those the model was trained on"
+    one, two = (percent(curve.observed[EXPECTED.index(share)]) for share in (0.6827, 0.9545))
+    line = f"scale of a frame within its one sigma: {one} (68 % if calibrated), within two: {two} (95 %)"
+    return line if curve.known == 1 else f"{line}; unknown in {percent(1 - curve.known)} of the frames"
 
 
 def write_sheet(path: Path, rows: Sequence[SheetRow], scaled: str, title: str) -> None:
