@@ -11,7 +11,7 @@ import pytest
 from slamdepth.backend import bundle_solver
 from slamdepth.backend.bundle import bundle_adjust
 from slamdepth.backend.bundle_problem import BundleProblem
-from slamdepth.backend.bundle_solver import HUBER
+from slamdepth.backend.bundle_solver import HUBER, State
 from slamdepth.geometry import invert, project, rotation_angle_rad, se3_exp, transform
 from slamdepth.types import Camera
 
@@ -61,6 +61,46 @@ def perturbed(problem: BundleProblem, size: float = 0.02, seed: int = 1) -> Bund
     return replace(
         problem, T_camera_world=T, points_w=problem.points_w + size * rng.normal(size=problem.points_w.shape)
     )
+
+
+def terrace(doubt: float) -> BundleProblem:
+    """Half of the points are a city 100 to 300 m away that is predicted, and starts, at 3 m."""
+    exact = truth(points=160)
+    far = np.arange(160) % 2 == 1
+    rng = np.random.default_rng(4)
+    rays = exact.points_w * [1.0, 1.0, 1.0]
+    X = np.where(far[:, None], rays * rng.uniform(50, 100, (160, 1)), rays)
+    at = X[exact.obs_point]
+    seen = np.einsum("nij,nj->ni", exact.T_camera_world[exact.obs_camera][:, :3, :3], at)
+    px, depth = project(CAMERA, seen + exact.T_camera_world[exact.obs_camera][:, :3, 3])
+    log_depth = np.where(far[exact.obs_point], np.log(3.0), np.log(np.maximum(depth, 0.1)))
+    start = np.where(far[:, None], X / np.linalg.norm(X, axis=1)[:, None] * 3.0, X)
+    return replace(
+        exact, px=px, points_w=start, log_depth=log_depth, sigma_log=np.full(len(px), 0.1 * 6), doubt=doubt
+    )
+
+
+def test_a_doubted_prior_does_not_bend_the_cameras() -> None:
+    exact = truth(points=160)
+    errors = []
+    for doubt in (1.0, 6.0):
+        found = bundle_adjust(terrace(doubt), (5, 5))
+        D = np.stack([invert(a) @ b for a, b in zip(found.T_camera_world, exact.T_camera_world, strict=True)])
+        errors.append(float(np.linalg.norm(D[:, :3, 3], axis=1).max()))
+    believed, doubted = errors
+    assert doubted < 0.002
+    assert believed > 5 * doubted
+
+
+def test_points_are_placed_without_moving_cameras() -> None:
+    problem = terrace(6.0)
+    order = np.argsort(problem.obs_camera, kind="stable")
+    solver = bundle_solver.Solver(problem, order)
+    state = State(problem.T_camera_world, problem.points_w, np.zeros(len(problem.fixed)), 0.0)
+    placed = solver.place_points(state)
+    np.testing.assert_array_equal(placed.T, problem.T_camera_world)
+    far = np.arange(160) % 2 == 1
+    assert np.median(np.linalg.norm(placed.X[far], axis=1)) > 30.0
 
 
 def noisy(problem: BundleProblem, sigma_px: float, seed: int = 2) -> BundleProblem:

@@ -18,6 +18,7 @@ from slamdepth.mapping.map import Map
 from slamdepth.tracking import adjuster
 from slamdepth.tracking.adjuster import Adjuster
 from slamdepth.tracking.rolling_shutter import RollingShutter
+from slamdepth.tracking.view_change import ViewChange
 from slamdepth.tracking.workers import Worker
 from slamdepth.types import Camera, Frame
 
@@ -200,7 +201,9 @@ def map_of(problem: BundleProblem) -> Map:
 def adjusted_from_two_starts(problem: BundleProblem) -> tuple[bool, np.ndarray]:
     map_, config = map_of(problem), Config()
     side = Worker("side")
-    two_starts = Adjuster(CAMERA, config, map_, RollingShutter(CAMERA, config.shutter, map_), side)
+    two_starts = Adjuster(
+        CAMERA, config, map_, RollingShutter(CAMERA, config.shutter, map_), ViewChange(map_), side
+    )
     is_better = two_starts.adjust_from_two_starts(list(range(COUNT)), map_.seen_by(2), (5, 5))
     side.close()
     return is_better, np.stack([k.T_camera_world for k in map_.keyframes])

@@ -67,6 +67,16 @@ def test_a_frame_found_by_a_wide_search_only_is_a_large_step(change: ViewChange)
     assert not change.is_large
 
 
+@pytest.mark.parametrize("is_doubted", [True, False])
+def test_depth_is_doubted_only_where_steps_are_large_and_nothing_supports_it(is_doubted: bool) -> None:
+    points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 3), (40, 3))
+    map_ = SimpleNamespace(landmarks=SimpleNamespace(position_w=points), scale_is_doubted=is_doubted)
+    change = ViewChange(cast(MapView, map_))
+    assert not change.doubts_depth
+    walk(change, TURN, 3)
+    assert change.doubts_depth == is_doubted
+
+
 def test_lost_frames_are_searched_at_once_and_then_now_and_again(change: ViewChange) -> None:
     assert [change.count_lost() for _ in range(9)] == [True] * 4 + [False] * 3 + [True, False]
     change.count_placed()

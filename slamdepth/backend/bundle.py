@@ -46,6 +46,8 @@ def bundle_adjust(
     cost = 0.0
     steps = 0
     solver = Solver(problem, keep)
+    if problem.doubt > 1.0:
+        state = solver.place_points(state)
     for phase, limit in enumerate(iterations):
         if phase:
             chi2 = _pixel_chi2(problem, state)

@@ -21,6 +21,9 @@ class BundleProblem:
         px: ``(M, 2)``; sigma_px: ``(M,)``.
         log_depth: ``(M,)`` log of the depth prior in metres of the map, NaN where none;
             sigma_log: ``(M,)`` its deviation.
+        doubt: factor by which ``sigma_log`` was widened where nothing supports the scale of the predictions,
+            else 1. Above 1, a prior that is off by more than about two deviations before the widening
+            does not pull (Geman and McClure), and points are placed before cameras move.
         px_rate: ``(M, 2)`` pixels by which a second of readout time moves each measurement;
             None leaves the readout time alone.
         sigma_scale: deviation ``s_a`` of a keyframe's common log depth error; 0 pins
@@ -39,6 +42,7 @@ class BundleProblem:
     sigma_log: Floats
     sigma_scale: float = 0.0
     px_rate: Floats | None = None
+    doubt: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ NumPy is slow at many tiny matrices and fast at a few long rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,9 @@ HUBER = 1.5
 CAUCHY = 2.0
 SCALE_CAUCHY = 2.0
 MIN_DEPTH_M = 0.01
+_POINT_STEPS = 4
+_WORTH = 0.98  # of the cost: steps of points that gain less are not worth their time
+_FARTHEST = 10.0  # times its distance: so far a point moves in one step
 _CAM = 7  # translation, rotation, log depth scale
 _DENSE_LIMIT = 4_000_000  # numbers in the camera-point block before it is kept sparse
 _GAIN = 1e-4  # relative fall of the cost below which another step is not worth its time
@@ -84,8 +87,34 @@ class Solver:
         self.free = np.flatnonzero(~problem.fixed | scaled)
         self.pinned = problem.fixed[self.free]
         self.P, self.K = len(problem.points_w), len(self.free)
+        self._doubts = problem.doubt > 1.0
+        self._depth_knee = CAUCHY / problem.doubt
+        if self._doubts:
+            self._first = np.zeros(self.P, dtype=np.int64)
+            self._first[self.pt[::-1]] = self.cam[::-1]
         bounds = np.searchsorted(self.cam, np.arange(len(problem.fixed) + 1)).tolist()
         self.blocks = [slice(bounds[k], bounds[k + 1]) for k in range(len(problem.fixed))]
+
+    def place_points(self, state: State) -> State:
+        """Move points only, to where the cameras as they are see them.
+
+        A point that was predicted 3 m away and is not would pull its cameras along in the first common step.
+        """
+        r, weight, P = self._residual(state)
+        cost = self._by_point(self._terms(r))
+        for _ in range(_POINT_STEPS):
+            before = cost.sum()
+            Hpp, bp, *_ = self._point_blocks(state, r, weight, P)
+            M = inverse_factor(Hpp, 1e-4)
+            X = self._moved(state, -transposed_times(M, times(M, bp)).T)
+            cost_new = self._by_point(self._terms(self._residual(replace(state, X=X))[0]))
+            better = cost_new < cost
+            cost = np.where(better, cost_new, cost)
+            state = replace(state, X=np.where(better[:, None], X, state.X))
+            if cost.sum() > _WORTH * before:
+                break
+            r, weight, P = self._residual(state)
+        return state
 
     def run(self, state: State, limit: int) -> tuple[State, float, float, int]:
         """At most ``limit`` steps; returns the state, the cost before and after, the steps taken."""
@@ -127,17 +156,30 @@ class Solver:
         r[2] = (np.log(P[2]) - state.a[self.cam] - self.log_depth) * self.inv_sigma_log
         weight = np.empty((2, P.shape[1]))
         weight[0] = HUBER / np.maximum(np.sqrt(r[0] * r[0] + r[1] * r[1]), HUBER)
-        weight[1] = 1.0 / (1.0 + (r[2] / CAUCHY) ** 2)
+        weight[1] = 1.0 / (1.0 + (r[2] / self._depth_knee) ** 2)
+        if self._doubts:  # Geman and McClure: what is grossly wrong does not pull
+            weight[1] *= weight[1]
         return r, weight, P
 
     def _cost(self, r: Floats, state: State) -> float:
-        norm = np.sqrt(r[0] * r[0] + r[1] * r[1])
-        pixel = np.where(norm > HUBER, 2 * HUBER * norm - HUBER * HUBER, norm * norm)
-        depth = CAUCHY * CAUCHY * np.log1p((r[2] / CAUCHY) ** 2)
+        pixel, depth = self._pixel_and_depth(r)
         total = float(pixel.sum() + depth.sum())
         if self.problem.sigma_scale > 0:
             total += float(np.sum(SCALE_CAUCHY**2 * np.log1p((state.a / self._scale_knee) ** 2)))
         return total
+
+    def _terms(self, r: Floats) -> Floats:
+        """Robust cost ``(N,)`` of each observation."""
+        pixel, depth = self._pixel_and_depth(r)
+        return pixel + depth
+
+    def _pixel_and_depth(self, r: Floats) -> tuple[Floats, Floats]:
+        norm = np.sqrt(r[0] * r[0] + r[1] * r[1])
+        pixel = np.where(norm > HUBER, 2 * HUBER * norm - HUBER * HUBER, norm * norm)
+        squared = (r[2] / self._depth_knee) ** 2
+        if self._doubts:
+            return pixel, r[2] ** 2 / (1.0 + squared)
+        return pixel, CAUCHY * CAUCHY * np.log1p(squared)
 
     def _point_blocks(
         self, state: State, r: Floats, weight: Floats, P: Floats
@@ -233,7 +275,22 @@ class Solver:
         T[self.free] = se3_exp(delta_c[:, :6]) @ T[self.free]
         if self.problem.sigma_scale > 0:
             a[self.free] += delta_c[:, 6]
-        return State(T, state.X + delta_p.T, a, state.readout_s + delta_r)
+        return State(T, self._moved(state, delta_p.T), a, state.readout_s + delta_r)
+
+    def _moved(self, state: State, step: Floats) -> Floats:
+        """Points ``(P, 3)`` after a step ``(P, 3)``; where depth is doubted, one of inverse distance.
+
+        A distance that was predicted at 3 m and is 300 m is found at once then; in distance itself each step
+        at most doubles it (Civera et al., "Inverse depth parametrization for monocular SLAM", 2008).
+        """
+        if not self._doubts:
+            return state.X + step
+        T = state.T[self._first]
+        offset = state.X + np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
+        along = np.einsum("ni,ni->n", step, offset) / np.maximum(np.einsum("ni,ni->n", offset, offset), 1e-12)
+        across = step - along[:, None] * offset
+        factor = 1.0 / np.maximum(1.0 - along, 1.0 / _FARTHEST)
+        return np.asarray(state.X - offset + factor[:, None] * (offset + across))
 
     def _reduced(self, system: _System, Z: Floats, y: Floats, damping: float) -> tuple[Floats, Floats]:
         """The camera system ``(7 K, 7 K)``, ``(7 K,)`` that is left when the points are eliminated."""

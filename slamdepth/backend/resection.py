@@ -176,6 +176,7 @@ class _Growth:
             sigma_log=np.ones(len(at)),
             sigma_scale=0.0,
             px_rate=None,
+            doubt=1.0,
         )
         found = bundle_adjust(part, _STEPS)
         self.T[cameras] = found.T_camera_world

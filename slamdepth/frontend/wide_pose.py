@@ -29,10 +29,10 @@ _CONTRADICTS = 2.0  # deviations of its inverse depth by which a landmark is see
 _RELEASED = 1e4  # factor on its covariance then
 _RELEASES = 2
 _SIGNIFICANT = 5.0  # deviations above what chance explains
-_NEAREST_M = 0.02
+NEAREST_M = 0.02
 _FAR = 1e3
 _MIN_PARALLAX = 3.0  # deviations of a keypoint, of a match that says something of the scale
-_MIN_VOTES = 8
+MIN_VOTES = 8
 _EPIPOLAR_PX = 2.0
 
 
@@ -82,7 +82,7 @@ def _is_farther(camera: Camera, T_camera_world: Floats, seen: Sighting) -> Bools
     first-order covariance in the image is that of the inverse depth.
     """
     points_c = transform(T_camera_world, seen.points_w)
-    ahead = points_c[:, 2] > _NEAREST_M
+    ahead = points_c[:, 2] > NEAREST_M
     points_c[~ahead] = [0.0, 0.0, 1.0]
     px, _ = project(camera, points_c)
     P = pixel_covariance(camera, T_camera_world, points_c, seen.covariance_w, np.zeros(len(px)))
@@ -96,7 +96,7 @@ def _is_farther(camera: Camera, T_camera_world: Floats, seen: Sighting) -> Bools
     ray_c = np.linalg.eigh(seen.covariance_w)[1][:, :, 2] @ T_camera_world[:3, :3].T
     ray_c *= np.where(np.einsum("ni,ni->n", ray_c, points_c) < 0, -1.0, 1.0)[:, None]
     far_c = points_c + _FAR * ray_c
-    is_beyond = far_c[:, 2] > _NEAREST_M
+    is_beyond = far_c[:, 2] > NEAREST_M
     far_c[~is_beyond] = [0.0, 0.0, 1.0]
     to_infinity, to_seen = project(camera, far_c)[0] - px, seen.px - px
     is_farther = np.einsum("ni,ni->n", to_infinity, to_seen) > 0
@@ -129,12 +129,12 @@ def pose_from_reference(
     scratch = pose_from_scratch(camera, seen.points_w, seen.px, seed=seed, minimum=max(8, minimum // 2))
     if scratch is not None:
         best, _ = directional_pose(camera, scratch[0], seen)
-    epipolar = _from_essential(camera, T_reference_world, reference_px, seen, seed=seed)
+    epipolar = from_essential(camera, T_reference_world, reference_px, seen, seed=seed)
     if epipolar is not None:
         other, _ = directional_pose(camera, epipolar, seen)
         if best is None or _explains_more(other, best, camera, seen):
             best = other
-    if best is None or np.count_nonzero(best.inliers) < max(minimum, _by_chance(len(seen.px), camera, seen)):
+    if best is None or np.count_nonzero(best.inliers) < max(minimum, by_chance(len(seen.px), camera, seen)):
         return None
     return best.T_camera_world, best.inliers
 
@@ -143,17 +143,17 @@ def _explains_more(other: PoseEstimate, best: PoseEstimate, camera: Camera, seen
     """Whether the epipolar pose explains more matches than chance would of those that PnP leaves."""
     left = int(np.count_nonzero(~best.inliers))
     gained = int(np.count_nonzero(other.inliers)) - int(np.count_nonzero(best.inliers))
-    return gained > _by_chance(left, camera, seen)
+    return gained > by_chance(left, camera, seen)
 
 
-def _by_chance(matches: int, camera: Camera, seen: Sighting) -> float:
+def by_chance(matches: int, camera: Camera, seen: Sighting) -> float:
     """Matches of unrelated images that would lie on their epipolar lines, and five deviations more."""
     share = 2.0 * np.sqrt(CHI2_2DOF_95) * float(np.median(seen.sigma_px)) / camera.height
     mean = matches * share
     return float(mean + _SIGNIFICANT * np.sqrt(mean) + _SIGNIFICANT)
 
 
-def _from_essential(
+def from_essential(
     camera: Camera, T_reference_world: Floats, reference_px: Floats, seen: Sighting, *, seed: int
 ) -> Floats | None:
     """Pose ``(4, 4)`` by the essential matrix, the length of its step from the landmarks' depths."""
@@ -172,14 +172,14 @@ def _from_essential(
     _, R, t, _ = cv2.recoverPose(E, a[agree], b[agree], camera.K)
     T_camera_reference = np.eye(4)
     T_camera_reference[:3, :3], T_camera_reference[:3, 3] = R, t.ravel()
-    length = _baseline(camera, T_camera_reference, T_reference_world, a, agree, seen)
+    length = baseline(camera, T_camera_reference, T_reference_world, a, agree, seen)
     if length is None:
         return None
     T_camera_reference[:3, 3] *= length
     return np.asarray(T_camera_reference @ T_reference_world)
 
 
-def _baseline(
+def baseline(
     camera: Camera,
     T_camera_reference: Floats,
     T_reference_world: Floats,
@@ -207,8 +207,8 @@ def _baseline(
     distance = np.maximum(np.linalg.norm(offset_w, axis=1), 1e-6)
     along = offset_w / distance[:, None]
     sigma_map = np.sqrt(np.einsum("ni,nij,nj->n", along, seen.covariance_w, along)) / distance
-    votes = agree & (z > 0) & (z_map > _NEAREST_M) & (parallax_px > _MIN_PARALLAX * seen.sigma_px)
-    if np.count_nonzero(votes) < _MIN_VOTES:
+    votes = agree & (z > 0) & (z_map > NEAREST_M) & (parallax_px > _MIN_PARALLAX * seen.sigma_px)
+    if np.count_nonzero(votes) < MIN_VOTES:
         return None
     log = np.log(z_map[votes] / z[votes])
     sigma = np.sqrt(sigma_map[votes] ** 2 + (seen.sigma_px[votes] / parallax_px[votes]) ** 2 + 0.03**2)

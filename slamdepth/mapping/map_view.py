@@ -25,6 +25,7 @@ def median_depth_m(T_camera_world: Floats, points_w: Floats) -> float:
 """Landmarks nearer to a camera, or behind it, are not seen by it."""
 
 _INITIAL_CAPACITY = 4096
+_DOUBTED_SHARE = 0.05  # of keyframes without a known scale; of images like the training's, 1 in 100 has none
 
 
 class MapView:
@@ -42,6 +43,7 @@ class MapView:
         self.landmarks: Landmarks = self._own.read_only(0)
         self.keyframes: tuple[MapKeyframe, ...] = ()
         self.starts: frozenset[int] = frozenset({0})
+        self._unsupported = 0
 
     @property
     def size(self) -> int:
@@ -53,6 +55,14 @@ class MapView:
         """Whether depth is a sensor's, so that the map is metric and its scale cannot drift."""
         prediction = self._states[0].prediction
         return prediction is not None and prediction.is_sensor
+
+    @property
+    def scale_is_doubted(self) -> bool:
+        """Whether the model says of too many keyframes that nothing supports the scale of their depth.
+
+        The other keyframes of the same place are hardly more like what the model knows.
+        """
+        return self._unsupported > _DOUBTED_SHARE * len(self._states)
 
     @property
     def T_world_camera(self) -> Floats:

@@ -16,6 +16,7 @@ from slamdepth.geometry import CHI2_2DOF_95, orthonormalised
 from slamdepth.mapping.map import AdjustedLandmarks, Map, MapKeyframe
 from slamdepth.mapping.observations import Observations
 from slamdepth.tracking.rolling_shutter import RollingShutter
+from slamdepth.tracking.view_change import ViewChange
 from slamdepth.tracking.workers import Worker
 from slamdepth.types import Camera
 from slamdepth.typing import Floats, Ints
@@ -55,12 +56,19 @@ class Adjuster:
     """Adjusts keyframes and landmarks of a map, at once or in another thread."""
 
     def __init__(
-        self, camera: Camera, config: Config, map_: Map, shutter: RollingShutter, side: Worker
+        self,
+        camera: Camera,
+        config: Config,
+        map_: Map,
+        shutter: RollingShutter,
+        view_change: ViewChange,
+        side: Worker,
     ) -> None:
         self._camera = camera.without_distortion()
         self._config = config
         self._map = map_
         self._shutter = shutter
+        self._view_change = view_change
         self._side = side
 
     def adjust(
@@ -212,6 +220,7 @@ class Adjuster:
             sigma_log=seen.sigma_log * (1.0 if is_sensor else config.prior_inflation),
             sigma_scale=0.0 if is_sensor else config.scale_sigma,
             px_rate=self._px_rate(keyframes, seen) if with_readout else None,
+            doubt=config.prior_inflation if self._view_change.doubts_depth else 1.0,
         )
         return _Part(problem, keyframes, landmark_ids, seen.feature)
 

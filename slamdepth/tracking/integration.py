@@ -78,7 +78,7 @@ class KeyframeIntegration:
         self._workers = workers
         self._timed = watch.timed
         self.mapper = LocalMapper(camera, config, map_, localiser)
-        self.adjuster = Adjuster(camera, config, map_, shutter, workers.side)
+        self.adjuster = Adjuster(camera, config, map_, shutter, localiser.view_change, workers.side)
         self.loops = LoopCloser(camera, config, map_, localiser)
         self._view_change = localiser.view_change
         self._policy = KeyframePolicy(config, map_, localiser.view_change)

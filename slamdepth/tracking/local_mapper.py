@@ -56,7 +56,8 @@ class LocalMapper:
 
         A prediction that disagrees with the map as a whole is dropped: the keyframe has no depth then.
         """
-        if not prediction.is_sensor and not self._agrees(keyframe, prediction):
+        is_doubted = self._localiser.view_change.doubts_depth
+        if not (prediction.is_sensor or is_doubted or self._agrees(keyframe, prediction)):
             log.warning("keyframe %d: its predicted depth disagrees with the map; not used", keyframe.id)
             prediction = replace(prediction, values=np.zeros_like(prediction.values))
             self.dropped += 1
@@ -75,7 +76,9 @@ class LocalMapper:
             aligned = prior + correction
             unseen = np.flatnonzero((keyframe.landmark_ids < 0) & certain)
             sigma[unseen] = field.correction(*(values[unseen] for values in there))[1]
-            new = self._creatable(keyframe, aligned, sigma, certain)
+            # in a map that has grown far beyond the network's range, that of its own values decides
+            in_range = np.where(np.isfinite(aligned), depth, np.nan) if is_doubted else aligned
+            new = self._creatable(keyframe, in_range, sigma, certain)
             log_depth, sigma_log = keyframe.log_depth.copy(), keyframe.sigma_log.copy()
             log_depth[new], sigma_log[new] = aligned[new], sigma[new]
             scale = float(np.exp(np.median(correction)))

@@ -17,6 +17,8 @@ from slamdepth.frontend.pose import (
     pose_from_scratch,
     refine_pose,
 )
+from slamdepth.frontend.ray_pose import RayPose, RaySighting, pose_with_depths
+from slamdepth.frontend.ray_start import pose_from_rays
 from slamdepth.frontend.wide_pose import Sighting, directional_pose, pose_from_reference
 from slamdepth.geometry import CHI2_2DOF_99, project, transform
 from slamdepth.mapping.map_view import NEAREST_M, MapView
@@ -226,7 +228,10 @@ class Localiser:
         *,
         is_judged: bool = False,
     ) -> Placement:
-        if self.view_change.is_large:
+        estimate: PoseEstimate | RayPose
+        if self.view_change.doubts_depth:
+            estimate = pose_with_depths(self._camera, T_start, self._rays(features, ids, at), rounds=rounds)
+        elif self.view_change.is_large:
             estimate, _ = directional_pose(self._camera, T_start, self._sighting(features, ids, at))
         else:
             estimate = refine_pose(
@@ -257,7 +262,7 @@ class Localiser:
         covariance[landmarks.observations[ids] < 2] *= self._config.bundle.prior_inflation**2
         return covariance
 
-    def _is_loose(self, placement: Placement, estimate: PoseEstimate) -> bool:
+    def _is_loose(self, placement: Placement, estimate: PoseEstimate | RayPose) -> bool:
         found_w = self._map.landmarks.position_w[placement.found_ids]
         errs_px = corner_deviation_px(self._camera, placement.T_camera_world, found_w, estimate.information)
         return bool(errs_px * np.sqrt(CHI2_2DOF_99) > POSE_PX)
@@ -266,6 +271,19 @@ class Localiser:
         landmarks = self._map.landmarks
         return Sighting(
             landmarks.position_w[ids], landmarks.covariance_w[ids], features.px[at], features.sigma_px[at]
+        )
+
+    def _rays(self, features: Features, ids: Ints, at: Ints) -> RaySighting:
+        landmarks = self._map.landmarks
+        points_w = landmarks.position_w[ids]
+        is_predicted = landmarks.observations[ids] < 2
+        return RaySighting(
+            points_w=points_w,
+            covariance_w=landmarks.covariance_w[ids],
+            px=features.px[at],
+            sigma_px=features.sigma_px[at],
+            origin_w=points_w - landmarks.distance_m[ids, None] * landmarks.direction_w[ids],
+            inflation=np.where(is_predicted, self._config.bundle.prior_inflation, 1.0),
         )
 
     def from_keyframe(
@@ -284,7 +302,16 @@ class Localiser:
             return None
         a, b = keyframe.features.match(features, has, ratio=0.85)
         ids = keyframe.landmark_ids[has[a]]
-        if self.view_change.is_large:
+        if self.view_change.doubts_depth:
+            solution = pose_from_rays(
+                self._camera,
+                keyframe.T_camera_world,
+                keyframe.features.px[has[a]],
+                self._rays(features, ids, b),
+                seed=self._config.seed,
+                minimum=max(8, need // 2),
+            )
+        elif self.view_change.is_large:
             solution = pose_from_reference(
                 self._camera,
                 keyframe.T_camera_world,
