@@ -2,10 +2,12 @@
 """Benchmarks of predicted depth alone: accuracy, places left out, latency.
 
     python -m benchmarks.depth accuracy SEQ... --models constant mean-image dinov2-mlp-32 dinov2
+    python -m benchmarks.depth accuracy SEQ... --train PAIRS --held-out 'PAIRS[40-73]' 'PAIRS[350-383]'
     python -m benchmarks.depth left-out SEQ... --samples 40 --coarse-epochs 5 --unmixed
     python -m benchmarks.depth latency --models dinov2 --threads 1 2 --data SEQ --output latency.json
 
-accuracy: baselines trained here and any depth models by name, judged on the same frames.
+accuracy: baselines trained here and any depth models by name, judged on the same frames; a table, and a few
+predictions as DATA.png. Times are of whole predictions with all cores.
 left-out: the head trained without each place and judged on it, and trained on all and judged on SEQ...
 latency: milliseconds before, in and after the ViT, for each device and number of threads.
 
@@ -18,9 +20,9 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +34,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from benchmarks.command import errors_in_one_line, parser_of, progress_line
 from benchmarks.depth_baselines import BASELINES, Baselines, Recipe
-from benchmarks.depth_judged import judged_row, mean_row, table
+from benchmarks.depth_blocks import Block, blocks_by_folder, every, held_out, open_pairs, without
+from benchmarks.depth_judged import judged_row, mean_row, only_place, table
 from benchmarks.depth_left_out import DEFAULT_CONFIG, left_out_rows, places_of, unmixed
+from benchmarks.depth_pictures import draw_kept
 from benchmarks.record import environment, write_benchmark
 from slamdepth.depth.registry import create_depth_model
 from slamdepth.errors import ConfigError
@@ -43,32 +47,48 @@ from slamdepth.training.data import data_folder
 from slamdepth.training.loop import train_depth
 from slamdepth.training.mlp import MlpSettings
 from slamdepth.training.progress import Progress, TrainStep
-from slamdepth.training.readers.pairs import PairPlace, PairReader
+from slamdepth.training.readers.pairs import PairPlace
 
 JUDGING_PLACE = "kitchen_kinect"
 """Training pairs of the place of a judging sequence; not trained on by default."""
 
+_LINE_EVERY_S = 30
 _CHANGES = {"members": int, "coarse_epochs": int, "fine_epochs": int, "seed": int}
 
 
 def accuracy(asked: argparse.Namespace) -> None:
     """Judge baselines and depth models on the same frames; print and write the table."""
     begun = environment()
-    rows = []
+    blocks = blocks_by_folder(asked.held_out)
+    judged = [only_place(path.resolve()) for path in asked.data]
+    judged += [held_out(folder, numbers) for folder, numbers in blocks.items()]
+    rows: list[dict[str, Any]] = []
+    files: dict[str, list[Path]] = {}
     with _bars() as start:
-        baselines = Baselines(_training_pairs(asked), MlpSettings(epochs=asked.epochs), asked.output, start)
+        pairs = _training_pairs(asked, blocks)
+        baselines = Baselines(pairs, _mlp_settings(asked), asked.output, start)
         for name in asked.models:
             recipe = baselines.recipe(name) if name in BASELINES else _by_name(name, asked.device)
-            for data in asked.data:
-                stem = name.replace(":", "_").replace("/", "_")
+            stem = name.replace(":", "_").replace("/", "_")
+            files[name] = [asked.output / f"{stem}@{place.name}.json" for place in judged]
+            for file, place in zip(files[name], judged, strict=True):
                 rows.append(
                     judged_row(
-                        asked.output / f"{stem}@{data.resolve().name}.json", name, recipe.make,
-                        data.resolve(), recipe.settings, stride=asked.stride, max_frames=asked.max_frames,
+                        file, name, recipe.make, place, recipe.settings,
+                        stride=asked.stride, max_frames=asked.max_frames, pictures=asked.pictures,
                     )
                 )  # fmt: skip
+    if asked.pictures:
+        draw_kept(asked.output, judged, files)
     print(table(rows))
-    write_benchmark(asked.output / "accuracy.json", begun, _settings(asked), rows=rows)
+    write_benchmark(
+        asked.output / "accuracy.json", begun, _settings(asked), rows=rows, losses=baselines.losses
+    )
+
+
+def _mlp_settings(asked: argparse.Namespace) -> dict[int, MlpSettings]:
+    epochs = {32: asked.epochs, 224: asked.epochs_224 or asked.epochs}
+    return {side: MlpSettings(side, epochs=n, bfloat16=asked.bfloat16) for side, n in epochs.items()}
 
 
 def _by_name(name: str, device: str) -> Recipe:
@@ -76,8 +96,8 @@ def _by_name(name: str, device: str) -> Recipe:
     return Recipe(lambda: model, {"weights": [info.sha256 for info in model.weights]})
 
 
-def _training_pairs(asked: argparse.Namespace) -> list[PairPlace]:
-    """The pairs to train baselines on; none where no baseline is asked for.
+def _training_pairs(asked: argparse.Namespace, blocks: Mapping[Path, Sequence[Block]]) -> list[PairPlace]:
+    """The pairs to train baselines on, without ``blocks``; none where no baseline is asked for.
 
     Raises:
         DatasetError: a folder holds no training pairs.
@@ -91,9 +111,11 @@ def _training_pairs(asked: argparse.Namespace) -> list[PairPlace]:
     ]  # fmt: skip
     if not folders:
         raise ConfigError("no training pairs in $SLAMDEPTH_DATA/depth_training; name them by --train")
-    places = [PairReader().open(folder) for folder in folders]
-    step = asked.train_stride
-    return [replace(place, images=place.images[::step], depths=place.depths[::step]) for place in places]
+    places = []
+    for place in map(open_pairs, folders):
+        left_out = blocks.get(place.images[0].parent, ())
+        places.append(every(without(place, left_out, asked.margin), asked.train_stride))
+    return places
 
 
 def left_out(asked: argparse.Namespace) -> None:
@@ -162,15 +184,21 @@ def _names(value: Any) -> Any:
 
 @contextmanager
 def _bars() -> Iterator[Callable[[str], Progress]]:
-    """Progress bars on a terminal; what it yields starts the bar of one training."""
+    """Progress bars on a terminal, else lines; what it yields starts the bar of one training."""
     console = Console(stderr=True)
     with Bar(console=console, disable=not console.is_terminal, transient=True) as bar:
 
         def start(name: str) -> Progress:
             task = bar.add_task(name)
 
+            shown_s = time.monotonic()
+
             def show(step: TrainStep) -> None:
+                nonlocal shown_s
                 described = f"{name}: {step.stage} {step.detail}".rstrip()
+                if not console.is_terminal and time.monotonic() - shown_s > _LINE_EVERY_S:
+                    progress_line(f"{described} ({step.done} of {step.total})")
+                    shown_s = time.monotonic()
                 bar.update(task, completed=step.done, total=step.total, description=described)
 
             return show
@@ -190,14 +218,22 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         return made
 
     one = command("accuracy", accuracy)
-    one.add_argument("data", type=Path, nargs="+", metavar="DATA", help="sequences with depth, or pairs")
+    one.add_argument("data", type=Path, nargs="*", metavar="DATA", help="sequences with depth, or pairs")
     one.add_argument("--models", nargs="+", default=[*BASELINES, "dinov2"], metavar="NAME",
                      help=f"baselines ({', '.join(BASELINES)}) and depth models")  # fmt: skip
     one.add_argument("--train", type=Path, nargs="+", metavar="PAIRS",
-                     help=f"pairs to train baselines on (default: $SLAMDEPTH_DATA/depth_training without "
-                     f"{JUDGING_PLACE})")  # fmt: skip
+                     help=f"pairs to train baselines on, a folder or some of its numbers, NAME[FIRST-LAST] "
+                     f"(default: $SLAMDEPTH_DATA/depth_training without {JUDGING_PLACE})")  # fmt: skip
+    one.add_argument("--held-out", type=Path, nargs="+", default=[], metavar="NAME[FIRST-LAST]",
+                     help="pairs left out of training and judged on, those of a folder together")  # fmt: skip
+    one.add_argument("--margin", type=_whole_number(0), default=4, metavar="N",
+                     help="numbers on each side of these left out of training too (default: 4)")  # fmt: skip
     one.add_argument("--train-stride", type=positive, default=1, metavar="N", help="train on every Nth pair")
     one.add_argument("--epochs", type=positive, default=MlpSettings.epochs, metavar="N")
+    one.add_argument("--epochs-224", type=positive, metavar="N", help="of 224 outputs (default: --epochs)")
+    one.add_argument("--bfloat16", action="store_true", help="train with products in bfloat16: faster")
+    one.add_argument("--pictures", type=_whole_number(0), default=4, metavar="N",
+                     help="frames of each data set to draw (default: 4)")  # fmt: skip
     two = command("left-out", left_out)
     two.add_argument("data", type=Path, nargs="*", metavar="DATA", help="must show none of the places")
     two.add_argument("--places", nargs="*", metavar="NAME", help="places to leave out (default: each)")
@@ -222,7 +258,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     three.add_argument("--repeats", type=positive, default=30, metavar="N")
     three.add_argument("--warm-up", type=_whole_number(0), default=5, metavar="N")
     three.add_argument("--output", "-o", type=Path, metavar="FILE", help="write the figures as JSON")
-    return parser.parse_args(arguments)
+    asked = parser.parse_args(arguments)
+    if asked.run is accuracy and not asked.data and not asked.held_out:
+        one.error("name DATA or --held-out to judge on")
+    return asked
 
 
 def _whole_number(least: int) -> Callable[[str], int]:

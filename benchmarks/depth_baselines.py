@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a depth network has to beat: a constant, the mean depth image, and the dissertation's MLP.
 
-The MLP is trained on DINOv2's tokens, as in the dissertation, and on the pixels alone, without a ViT.
+The MLP is trained on DINOv2's tokens, as in the dissertation, and on the pixels alone, without a ViT; on the
+tokens also without SSIM in the loss.
 """
 
 from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,12 +34,14 @@ from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 from slamdepth.typing import Floats32
 
 MLPS = {
-    "dinov2-mlp-32": ("tokens", 32),
-    "dinov2-mlp-224": ("tokens", 224),
-    "pixel-mlp-32": ("pixels", 32),
-    "pixel-mlp-224": ("pixels", 224),
+    "dinov2-mlp-32": ("tokens", 32, True),
+    "dinov2-mlp-32-mse": ("tokens", 32, False),
+    "dinov2-mlp-224": ("tokens", 224, True),
+    "dinov2-mlp-224-mse": ("tokens", 224, False),
+    "pixel-mlp-32": ("pixels", 32, True),
+    "pixel-mlp-224": ("pixels", 224, True),
 }
-"""Trained baselines: what they see, and the side of their depth map in pixels."""
+"""Trained baselines: what they see, the side of their depth map in pixels, whether SSIM is in the loss."""
 
 BASELINES = ("constant", "mean-image", *MLPS)
 _PIXELS = 3 * SIDE * SIDE
@@ -126,18 +129,24 @@ class Baselines:
 
     Args:
         places: training pairs.
+        settings: of the trainings, by the side of the depth map; one setting for both where it is no mapping.
         folder: where trained heads are kept; one with the same settings is not trained again.
         progress: called with the name of a training; returns the function that its steps are passed to.
+
+    Attributes:
+        losses: mean loss of each epoch of the heads that were trained or found in ``folder``, by name.
     """
 
     def __init__(
         self,
         places: list[PairPlace],
-        settings: MlpSettings,
+        settings: MlpSettings | Mapping[int, MlpSettings],
         folder: Path,
         progress: Callable[[str], Progress] = lambda name: silent,
     ) -> None:
-        self.places, self.settings, self.folder = places, settings, folder
+        self.places, self.folder = places, folder
+        self._settings = settings if isinstance(settings, Mapping) else {32: settings, 224: settings}
+        self.losses: dict[str, list[float]] = {}
         self._progress = progress
 
     def recipe(self, name: str) -> Recipe:
@@ -147,11 +156,18 @@ class Baselines:
             return Recipe(functools.cache(self._constant), seen)
         if name == "mean-image":
             return Recipe(functools.cache(self._mean_image), seen)
-        return Recipe(functools.cache(lambda: self._trained(name)), {**asdict(self.settings), **seen})
+        return Recipe(
+            functools.cache(lambda: self._trained(name)), {**asdict(self.settings_of(name)), **seen}
+        )
+
+    def settings_of(self, name: str) -> MlpSettings:
+        """The settings of the training of one of :data:`MLPS`."""
+        _, output, ssim = MLPS[name]
+        return replace(self._settings[output], output=output, ssim=ssim)
 
     @property
     def _seen(self) -> list[str]:
-        return [f"{place.name} {len(place)}" for place in self.places]
+        return [f"{place.name} {len(place)} {place.fingerprint}" for place in self.places]
 
     @functools.cached_property
     def _pairs(self) -> MlpPairs:
@@ -183,8 +199,7 @@ class Baselines:
         return MeanImageDepth(filled.astype(np.float32), self._focal_px)
 
     def _trained(self, name: str) -> DepthModel:
-        source, output = MLPS[name]
-        settings = replace(self.settings, output=output)
+        source, settings = MLPS[name][0], self.settings_of(name)
         described = json.dumps({**asdict(settings), "places": self._seen})
         file = self.folder / f"{name}.safetensors"
         if not _was_trained(file, described):
@@ -200,6 +215,7 @@ class Baselines:
                 "losses": json.dumps(losses),
             }
             save_mlp(file, head, about)
+        self.losses[name] = json.loads(read_header(file)["losses"])
         return Dinov2Mlp.load(weights=file) if source == "tokens" else PixelMlp.load(file)
 
 

@@ -34,7 +34,7 @@ def frame_of(focal_px: float = 60.0) -> Frame:
 def make_place(folder: Path, depth_mm: int, count: int = 3) -> Path:
     folder.mkdir(parents=True)
     for k in range(count):
-        cv2.imwrite(str(folder / f"{k:05d}.jpg"), np.full((48, 64, 3), 20 * k, np.uint8))
+        cv2.imwrite(str(folder / f"{k:05d}.jpg"), np.full((48, 64, 3), 10 * k, np.uint8))
         depth = np.full((48, 64), depth_mm, np.uint16)
         depth[:, 32:] += 500
         cv2.imwrite(str(folder / f"{k:05d}.png"), depth)

@@ -20,6 +20,7 @@ from slamdepth.training.mlp import (
     MlpPairs,
     MlpSettings,
     cached_tokens,
+    mse_loss,
     mse_ssim_loss,
     shrink,
     train_mlp,
@@ -31,13 +32,16 @@ def test_the_loss_is_mse_times_exp_of_one_less_ssim() -> None:
     rng = np.random.default_rng(0)
     predicted, target = rng.uniform(1, 3, (2, 2, 32, 32)).astype(np.float32)
     target[rng.random(target.shape) < 0.3] = 0.0
-    by_hand = []
+    by_hand, squared = [], []
     for p, t in zip(predicted, target, strict=True):
         known = t > 0
         mse = np.mean((p[known] - t[known]) ** 2)
+        squared.append(mse)
         by_hand.append(mse * math.exp(1 - depth_ssim(p, t, known)))
     loss = mse_ssim_loss(torch.from_numpy(predicted), torch.from_numpy(target))
     assert float(loss) == pytest.approx(np.mean(by_hand), rel=1e-4)
+    alone = mse_loss(torch.from_numpy(predicted), torch.from_numpy(target))
+    assert float(alone) == pytest.approx(np.mean(squared), rel=1e-5)
     assert float(mse_ssim_loss(torch.from_numpy(target), torch.from_numpy(target))) == 0.0
 
 
@@ -77,6 +81,18 @@ def test_training_converges_and_is_reproducible() -> None:
     assert np.abs(predicted - depth[:, 0, 0]).mean() < 0.2
     assert np.corrcoef(predicted, depth[:, 0, 0])[0, 1] > 0.95
     assert train_mlp(features, depth, replace(settings, epochs=5))[1] == losses[:5]
+    rounded = train_mlp(features, depth, replace(settings, epochs=5, bfloat16=True))[1]
+    assert rounded == pytest.approx(losses[:5], rel=0.05)
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
+def test_without_ssim_the_loss_is_the_squared_error() -> None:
+    features = np.linspace(0, 1, 8, dtype=np.float32).reshape(8, 1)
+    depth = np.full((8, 224, 224), 2.0, np.float32)
+    settings = MlpSettings(epochs=1, batch=8, hidden=4, ssim=False)
+    _, (loss,) = train_mlp(features, depth, settings)
+    _, (with_ssim,) = train_mlp(features, depth, replace(settings, ssim=True))
+    assert 0 < loss < with_ssim
 
 
 def test_depth_is_normalised_to_one_focal_length() -> None:

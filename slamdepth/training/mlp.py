@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training of the dissertation's network: three fully connected layers over all DINOv2 tokens.
 
-Loss MSE * exp(1 - SSIM), Adam at 1e-4, no augmentation, images resized to 224 x 224 without keeping
-their aspect. Depth is normalised to one focal length, so that places seen by different cameras agree.
+Loss MSE * exp(1 - SSIM) or MSE alone, Adam at 1e-4, no augmentation, images resized to 224 x 224 without
+keeping their aspect. Depth is normalised to one focal length, so that places seen by different cameras agree.
 The same training without the ViT, on the pixels themselves, is the dissertation's ablation.
 """
 
@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -43,16 +44,20 @@ class MlpSettings:
 
     Attributes:
         output: side of the depth map, 32 or 224.
+        ssim: the loss is MSE * exp(1 - SSIM); False: MSE.
         hidden: width of the two inner layers.
+        bfloat16: matrix products round their factors to bfloat16: twice as fast on processors that have it.
         min_m, max_m: range of the sensor depths trained on.
     """
 
     output: int = 32
+    ssim: bool = True
     epochs: int = 20
     batch: int = 32
     learning_rate: float = 1e-4
     hidden: int = 1024
     seed: int = 0
+    bfloat16: bool = False
     min_m: float = 0.2
     max_m: float = 10.0
 
@@ -156,6 +161,7 @@ def train_mlp(
     target = shrink(torch.from_numpy(in_range.astype(np.float32)), settings.output)
     # The fused step is several times faster on a CPU, where Adam costs as much as the network.
     optimiser = torch.optim.Adam(head.parameters(), lr=settings.learning_rate, fused=True)
+    loss_of = mse_ssim_loss if settings.ssim else mse_loss
     rng = np.random.default_rng(settings.seed)
     losses: list[float] = []
     for epoch in range(settings.epochs):
@@ -165,9 +171,10 @@ def train_mlp(
         for start in starts:
             chosen = np.sort(order[start : start + settings.batch])
             x = torch.from_numpy(np.asarray(features[chosen], dtype=np.float32)).to(device)
-            loss = mse_ssim_loss(head(x), target[chosen].to(device))
             optimiser.zero_grad(set_to_none=True)
-            torch.autograd.backward(loss)
+            with _rounded_products(settings.bfloat16):
+                loss = loss_of(head(x), target[chosen].to(device))
+                torch.autograd.backward(loss)
             optimiser.step()
             total += float(loss.detach())
         losses.append(total / len(starts))
@@ -176,6 +183,23 @@ def train_mlp(
         logger.info("epoch %d: loss %.4f", epoch + 1, losses[-1])
         progress(TrainStep("training", epoch + 1, settings.epochs, f"loss {losses[-1]:.4f}"))
     return head.eval().requires_grad_(False), losses
+
+
+@contextmanager
+def _rounded_products(bfloat16: bool) -> Iterator[None]:
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium" if bfloat16 else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def mse_loss(predicted_m: Tensor, target_m: Tensor) -> Tensor:
+    """MSE over each image's known pixels, then the mean over images; arguments of :func:`mse_ssim_loss`."""
+    weight = (target_m > 0).to(predicted_m.dtype)
+    loss: Tensor = _squared_error(predicted_m, target_m, weight).mean()
+    return loss
 
 
 def mse_ssim_loss(predicted_m: Tensor, target_m: Tensor) -> Tensor:
@@ -187,13 +211,21 @@ def mse_ssim_loss(predicted_m: Tensor, target_m: Tensor) -> Tensor:
             :func:`slamdepth.evaluation.depth_maps.depth_ssim`.
     """
     weight = (target_m > 0).to(predicted_m.dtype)
-    count = weight.sum(dim=(1, 2)).clamp_min(1.0)
-    mse = ((predicted_m - target_m).square() * weight).sum(dim=(1, 2)) / count
+    mse = _squared_error(predicted_m, target_m, weight)
     data_range = target_m.amax(dim=(1, 2), keepdim=True).clamp_min(1e-3)
     similar = ssim_map(predicted_m, target_m, weight, _blur, data_range)
-    ssim = (similar * weight).sum(dim=(1, 2)) / count
+    ssim = (similar * weight).sum(dim=(1, 2)) / _known(weight)
     loss: Tensor = (mse * (1.0 - ssim).exp()).mean()
     return loss
+
+
+def _squared_error(predicted_m: Tensor, target_m: Tensor, weight: Tensor) -> Tensor:
+    squared: Tensor = (predicted_m - target_m).square() * weight
+    return squared.sum(dim=(1, 2)) / _known(weight)
+
+
+def _known(weight: Tensor) -> Tensor:
+    return weight.sum(dim=(1, 2)).clamp_min(1.0)
 
 
 def shrink(depth_m: Tensor, side: int) -> Tensor:
@@ -207,8 +239,11 @@ def shrink(depth_m: Tensor, side: int) -> Tensor:
 
 
 def _blur(maps: Tensor) -> Tensor:
-    offsets = torch.arange(SSIM_WINDOW, dtype=maps.dtype, device=maps.device) - SSIM_WINDOW // 2
-    kernel = torch.exp(-offsets.square() / (2 * SSIM_SIGMA**2))
-    kernel = kernel / kernel.sum()
-    x = F.conv2d(maps[:, None], kernel.view(1, 1, 1, -1), padding=(0, SSIM_WINDOW // 2))
-    return F.conv2d(x, kernel.view(1, 1, -1, 1), padding=(SSIM_WINDOW // 2, 0))[:, 0]
+    # A banded matrix from both sides: on a CPU five times faster than convolutions of one channel.
+    at = torch.arange(maps.shape[-1], dtype=maps.dtype, device=maps.device)
+    offsets = at[:, None] - at
+    window = torch.arange(SSIM_WINDOW, dtype=maps.dtype, device=maps.device) - SSIM_WINDOW // 2
+    total = torch.exp(-window.square() / (2 * SSIM_SIGMA**2)).sum()
+    band = torch.exp(-offsets.square() / (2 * SSIM_SIGMA**2)) / total
+    band = torch.where(offsets.abs() <= SSIM_WINDOW // 2, band, 0.0)
+    return band @ maps @ band
