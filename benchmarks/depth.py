@@ -82,7 +82,7 @@ def accuracy(asked: argparse.Namespace) -> None:
         draw_kept(asked.output, judged, files)
     print(table(rows))
     write_benchmark(
-        asked.output / "accuracy.json", begun, _settings(asked), rows=rows, losses=baselines.losses
+        asked.output / "accuracy.json", begun, _settings(asked), rows=rows, losses=baselines.losses()
     )
 
 

@@ -132,9 +132,6 @@ class Baselines:
         settings: of the trainings, by the side of the depth map; one setting for both where it is no mapping.
         folder: where trained heads are kept; one with the same settings is not trained again.
         progress: called with the name of a training; returns the function that its steps are passed to.
-
-    Attributes:
-        losses: mean loss of each epoch of the heads that were trained or found in ``folder``, by name.
     """
 
     def __init__(
@@ -146,7 +143,6 @@ class Baselines:
     ) -> None:
         self.places, self.folder = places, folder
         self._settings = settings if isinstance(settings, Mapping) else {32: settings, 224: settings}
-        self.losses: dict[str, list[float]] = {}
         self._progress = progress
 
     def recipe(self, name: str) -> Recipe:
@@ -164,6 +160,17 @@ class Baselines:
         """The settings of the training of one of :data:`MLPS`."""
         _, output, ssim = MLPS[name]
         return replace(self._settings[output], output=output, ssim=ssim)
+
+    def losses(self) -> dict[str, list[float]]:
+        """Mean loss of each epoch of the trained heads in the folder, by name."""
+        done = [name for name in MLPS if _was_trained(self._file(name), self._described(name))]
+        return {name: json.loads(read_header(self._file(name))["losses"]) for name in done}
+
+    def _file(self, name: str) -> Path:
+        return self.folder / f"{name}.safetensors"
+
+    def _described(self, name: str) -> str:
+        return json.dumps({**asdict(self.settings_of(name)), "places": self._seen})
 
     @property
     def _seen(self) -> list[str]:
@@ -200,8 +207,7 @@ class Baselines:
 
     def _trained(self, name: str) -> DepthModel:
         source, settings = MLPS[name][0], self.settings_of(name)
-        described = json.dumps({**asdict(settings), "places": self._seen})
-        file = self.folder / f"{name}.safetensors"
+        described, file = self._described(name), self._file(name)
         if not _was_trained(file, described):
             pixels = self._pairs.image_rgb.reshape(len(self._pairs), -1)
             features = self._tokens if source == "tokens" else pixels
@@ -215,7 +221,6 @@ class Baselines:
                 "losses": json.dumps(losses),
             }
             save_mlp(file, head, about)
-        self.losses[name] = json.loads(read_header(file)["losses"])
         return Dinov2Mlp.load(weights=file) if source == "tokens" else PixelMlp.load(file)
 
 

@@ -85,6 +85,6 @@ def test_the_network_is_trained_with_and_without_ssim(
         baselines.recipe(name).make()
     asked = [(settings.output, settings.ssim, settings.epochs) for settings in trained]
     assert asked == [(32, True, 2), (32, False, 2), (224, False, 1)]
-    assert baselines.losses == {name: [2.0, 1.0] for name in names}
+    assert baselines.losses() == {name: [2.0, 1.0] for name in names}
     Baselines([place], MlpSettings(epochs=2), tmp_path).recipe("dinov2-mlp-32").make()
     assert len(trained) == 3  # found
