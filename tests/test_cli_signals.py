@@ -86,7 +86,11 @@ def test_an_interrupted_rendering_says_that_it_goes_on(
 
     monkeypatch.setattr(sequence, "render_frame", interrupted_at_the_fourth)
     out = tmp_path / "room"
-    done = call("synth", out, "--frames", 8, "--width", 64, "--height", 48)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs ignore it
+    try:
+        done = call("synth", out, "--frames", 8, "--width", 64, "--height", 48)
+    finally:
+        signal.signal(signal.SIGINT, before)
     message = f"error: interrupted: 3 of 8 frames are kept in {out}; the same command goes on\n"
     assert (done.returncode, done.stderr) == (130, message)
     assert len(list(out.glob("rgb/*.png"))) == 3
