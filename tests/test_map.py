@@ -76,7 +76,8 @@ class MapOperations(RuleBasedStateMachine):
         other_side = self._living(rng)[: rng.integers(0, 6)]
         ids[rng.permutation(8)[: len(other_side)]] = other_side
         self.map.fuse_view(keyframe, ids)
-        self._note_fusions(ids[ids >= 0], was[ids >= 0])
+        fresh = (ids >= 0) & ~np.isin(ids, was)  # what the keyframe sees already stays where it is
+        self._note_fusions(ids[fresh], was[fresh])
 
     def _note_fusions(self, ids: Ints, was: Ints) -> None:
         """Remember which of two landmarks is left where a feature saw one and was given another."""
