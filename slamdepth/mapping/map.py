@@ -92,8 +92,6 @@ class Map(MapView):
         """Give a keyframe its depth; for the arguments see :class:`MapKeyframe`."""
         state = self._states[keyframe.id]
         state.prediction = StoredPrediction(prediction)
-        if prediction.scale_sigma_log is not None and math.isinf(prediction.scale_sigma_log):
-            self._unsupported += 1
         state.log_depth, state.sigma_log = log_depth.copy(), sigma_log.copy()
         if predicted_log_depth is not None:
             state.predicted_log_depth = predicted_log_depth.copy()
@@ -331,7 +329,6 @@ class Map(MapView):
             state.id += first_keyframe
             state.landmark_ids = np.where(state.landmark_ids >= 0, state.landmark_ids + first_landmark, -1)
         self._states += other._states
-        self._unsupported += other._unsupported
         self.keyframes = (*self.keyframes, *other.keyframes)
         self.starts |= {first_keyframe + start for start in other.starts}
         return first_keyframe, first_landmark

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -14,18 +15,16 @@ from slamdepth.mapping.map_keyframe import KeyframeState, MapKeyframe, read_only
 from slamdepth.typing import Floats, Ints
 
 NEAREST_M = 0.05
+"""Landmarks nearer to a camera, or behind it, are not seen by it."""
+
+_INITIAL_CAPACITY = 4096
+_DOUBTED_SHARE = 0.05  # of keyframes without a known scale; of images like the training's, 1 in 200 has none
 
 
 def median_depth_m(T_camera_world: Floats, points_w: Floats) -> float:
     """Median depth of points ``(N, 3)``, at least one, seen by a camera ``(4, 4)``; at least 0.05 m."""
     depths = np.sort(points_w @ T_camera_world[2, :3] + T_camera_world[2, 3])
     return max(float(depths[len(depths) // 2]), NEAREST_M)
-
-
-"""Landmarks nearer to a camera, or behind it, are not seen by it."""
-
-_INITIAL_CAPACITY = 4096
-_DOUBTED_SHARE = 0.05  # of keyframes without a known scale; of images like the training's, 1 in 100 has none
 
 
 class MapView:
@@ -43,7 +42,6 @@ class MapView:
         self.landmarks: Landmarks = self._own.read_only(0)
         self.keyframes: tuple[MapKeyframe, ...] = ()
         self.starts: frozenset[int] = frozenset({0})
-        self._unsupported = 0
 
     @property
     def size(self) -> int:
@@ -62,7 +60,11 @@ class MapView:
 
         The other keyframes of the same place are hardly more like what the model knows.
         """
-        return self._unsupported > _DOUBTED_SHARE * len(self._states)
+        unknown = sum(
+            state.prediction is not None and state.prediction.scale_sigma_log == math.inf
+            for state in self._states
+        )
+        return unknown > _DOUBTED_SHARE * len(self._states)
 
     @property
     def T_world_camera(self) -> Floats:
