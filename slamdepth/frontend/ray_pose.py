@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamdepth.frontend.pose import HUBER
+from slamdepth.frontend.pose import HUBER, PoseEstimate
 from slamdepth.frontend.wide_pose import NEAREST_M, Sighting
 from slamdepth.geometry import CHI2_2DOF_95, se3_exp
 from slamdepth.types import Camera
@@ -41,19 +41,13 @@ class RaySighting(Sighting):
 
 
 @dataclass(frozen=True)
-class RayPose:
+class RayPose(PoseEstimate):
     """A pose and what it explains.
 
     Attributes:
-        T_camera_world: ``(4, 4)``.
-        inliers: ``(N,)``.
-        information: ``(6, 6)`` of the left perturbation (translation, rotation).
         cost: sum of squared whitened residuals, each at most as large as an outlier's (MSAC).
     """
 
-    T_camera_world: Floats
-    inliers: Bools
-    information: Floats
     cost: float
 
 

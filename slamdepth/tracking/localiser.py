@@ -17,9 +17,9 @@ from slamdepth.frontend.pose import (
     pose_from_scratch,
     refine_pose,
 )
-from slamdepth.frontend.ray_pose import RayPose, RaySighting, pose_with_depths
+from slamdepth.frontend.ray_pose import RaySighting, pose_with_depths
 from slamdepth.frontend.ray_start import pose_from_rays
-from slamdepth.frontend.wide_pose import Sighting, directional_pose, pose_from_reference
+from slamdepth.frontend.wide_pose import directional_pose, pose_from_reference
 from slamdepth.geometry import CHI2_2DOF_99, project, transform
 from slamdepth.mapping.map_view import NEAREST_M, MapView
 from slamdepth.mapping.placement import PlacedBy, Placement
@@ -228,9 +228,11 @@ class Localiser:
         *,
         is_judged: bool = False,
     ) -> Placement:
-        estimate: PoseEstimate | RayPose
+        estimate: PoseEstimate
         if self.view_change.doubts_depth:
-            estimate = pose_with_depths(self._camera, T_start, self._rays(features, ids, at), rounds=rounds)
+            estimate = pose_with_depths(
+                self._camera, T_start, self._sighting(features, ids, at), rounds=rounds
+            )
         elif self.view_change.is_large:
             estimate, _ = directional_pose(self._camera, T_start, self._sighting(features, ids, at))
         else:
@@ -262,18 +264,12 @@ class Localiser:
         covariance[landmarks.observations[ids] < 2] *= self._config.bundle.prior_inflation**2
         return covariance
 
-    def _is_loose(self, placement: Placement, estimate: PoseEstimate | RayPose) -> bool:
+    def _is_loose(self, placement: Placement, estimate: PoseEstimate) -> bool:
         found_w = self._map.landmarks.position_w[placement.found_ids]
         errs_px = corner_deviation_px(self._camera, placement.T_camera_world, found_w, estimate.information)
         return bool(errs_px * np.sqrt(CHI2_2DOF_99) > POSE_PX)
 
-    def _sighting(self, features: Features, ids: Ints, at: Ints) -> Sighting:
-        landmarks = self._map.landmarks
-        return Sighting(
-            landmarks.position_w[ids], landmarks.covariance_w[ids], features.px[at], features.sigma_px[at]
-        )
-
-    def _rays(self, features: Features, ids: Ints, at: Ints) -> RaySighting:
+    def _sighting(self, features: Features, ids: Ints, at: Ints) -> RaySighting:
         landmarks = self._map.landmarks
         points_w = landmarks.position_w[ids]
         is_predicted = landmarks.observations[ids] < 2
@@ -302,17 +298,9 @@ class Localiser:
             return None
         a, b = keyframe.features.match(features, has, ratio=0.85)
         ids = keyframe.landmark_ids[has[a]]
-        if self.view_change.doubts_depth:
-            solution = pose_from_rays(
-                self._camera,
-                keyframe.T_camera_world,
-                keyframe.features.px[has[a]],
-                self._rays(features, ids, b),
-                seed=self._config.seed,
-                minimum=max(8, need // 2),
-            )
-        elif self.view_change.is_large:
-            solution = pose_from_reference(
+        if self.view_change.is_large:
+            pose_from = pose_from_rays if self.view_change.doubts_depth else pose_from_reference
+            solution = pose_from(
                 self._camera,
                 keyframe.T_camera_world,
                 keyframe.features.px[has[a]],
