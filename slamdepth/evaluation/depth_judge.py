@@ -20,7 +20,7 @@ from slamdepth.evaluation.calibration import Coverage, coverage_of, observed
 from slamdepth.evaluation.depth import depth_errors
 from slamdepth.evaluation.depth_fit import affine_fit, apply_affine, fits_in
 from slamdepth.evaluation.depth_maps import EdgeScore, depth_ssim, edge_score
-from slamdepth.evaluation.depth_pixels import MAX_M, MIN_M, STRIDE, ComparedPixels, FramePixels, as_depth
+from slamdepth.evaluation.depth_pixels import MAX_M, MIN_M, STRIDE, ComparedPixels, as_depth
 from slamdepth.types import DepthKind, DepthPrediction
 from slamdepth.typing import Floats
 
@@ -159,12 +159,12 @@ class DepthJudge:
         if found is None:
             return False
         self._ratios.append(found.ratios.astype(np.float32))
-        self._uncertainties.append(_uncertainty(found, prediction.sigma_log, self.kind is DepthKind.METRIC))
+        self._uncertainties.append({})
         if prediction.sigma_log is not None:
-            error = np.log(found.depth / found.sensor_m)
-            self._pixel_coverages.append(
-                observed(error - np.median(error), prediction.sigma_log[found.where].astype(np.float64))
-            )
+            error, sigma = np.log(found.depth / found.sensor_m), prediction.sigma_log[found.where]
+            if len(error) >= 2:
+                self._uncertainties[-1] = _uncertainty(error, sigma, self.kind is DepthKind.METRIC)
+            self._pixel_coverages.append(observed(error - np.median(error), sigma.astype(np.float64)))
         if prediction.scale_sigma_log is not None:
             self._scale_sigmas.append(prediction.scale_sigma_log)
         for array in (as_depth(prediction.values, self.kind), self._compared.in_range(sensor_m)):
@@ -273,13 +273,7 @@ class _Bins:
         )
 
 
-def _uncertainty(
-    found: FramePixels, sigma_log: NDArray[np.floating] | None, is_metric: bool
-) -> dict[str, float]:
-    if sigma_log is None or len(found.depth) < 2:
-        return {}
-    sigma = sigma_log[found.where]
-    error = np.log(found.depth / found.sensor_m)
+def _uncertainty(error: Floats, sigma: NDArray[np.floating], is_metric: bool) -> dict[str, float]:
     scaled = np.abs(np.expm1(error - np.median(error)))
     sure = sigma <= np.median(sigma)
     known = {"surest_half": float(scaled[sure].mean() / max(float(scaled.mean()), 1e-9))}
