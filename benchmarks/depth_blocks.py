@@ -8,7 +8,6 @@ too, and are not judged on.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from slamdepth.errors import ConfigError, DatasetError
@@ -57,8 +56,7 @@ def held_out(folder: Path, blocks: Sequence[Block]) -> PairPlace:
     place = PairReader().open(folder)
     for block in blocks:
         place.between(*block)
-    whole = _numbered(place, blocks)
-    return _part(place, f"{place.name}-held-out", whole)
+    return place.part(f"{place.name}-held-out", _numbered(place, blocks))
 
 
 def without(place: PairPlace, blocks: Sequence[Block], margin: int) -> PairPlace:
@@ -71,29 +69,14 @@ def without(place: PairPlace, blocks: Sequence[Block], margin: int) -> PairPlace
     kept = [k for k in range(len(place)) if k not in left_out]
     if not kept:
         raise DatasetError(f"{place.name}: every pair is held out or next to one that is")
-    return _part(place, place.name, kept)
+    return place.part(place.name, kept)
 
 
 def every(place: PairPlace, step: int) -> PairPlace:
     """Every ``step``-th pair of ``place``."""
-    return _part(place, place.name, range(0, len(place), step))
+    return place.part(place.name, range(0, len(place), step))
 
 
 def _numbered(place: PairPlace, blocks: Sequence[Block]) -> list[int]:
-    """Indices of the pairs whose number is in one of ``blocks``."""
-    return [
-        k
-        for k, path in enumerate(place.images)
-        if path.stem.isdigit() and any(first <= int(path.stem) <= last for first, last in blocks)
-    ]
-
-
-def _part(place: PairPlace, name: str, indices: Iterable[int]) -> PairPlace:
-    kept = list(indices)
-    return replace(
-        place,
-        name=name,
-        images=tuple(place.images[k] for k in kept),
-        depths=tuple(place.depths[k] for k in kept),
-        gravities=tuple(place.gravities[k] for k in kept) if place.gravities else (),
-    )
+    """Indices of the pairs whose number is in one of ``blocks``, in order."""
+    return sorted({k for first, last in blocks for k in place.numbered(first, last)})

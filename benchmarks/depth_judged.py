@@ -19,7 +19,7 @@ from slamdepth.depth.evaluate import judge_depth
 from slamdepth.errors import DatasetError
 from slamdepth.evaluation.depth_fit import fitted_to_sensor
 from slamdepth.io import replacing
-from slamdepth.pipeline.depth_data import open_depth_data, readable, thinned
+from slamdepth.pipeline.depth_data import open_depth_data, readable, shown, thinned
 from slamdepth.training.data import Place
 from slamdepth.types import DepthPrediction, Frame
 from slamdepth.typing import Floats
@@ -78,7 +78,7 @@ def judged_row(
     model = _Timed(make())
     place = only_place(data) if isinstance(data, Path) else data
     chosen = thinned(place, stride, max_frames)
-    wanted = spread(chosen, pictures)
+    wanted = shown(chosen, pictures)
     kept: dict[str, Any] = {}
 
     def watch(frame: Frame, prediction: DepthPrediction) -> None:
@@ -119,12 +119,6 @@ def kept_predictions(file: Path) -> dict[int, Floats]:
     """
     with np.load(file.with_suffix(".npz")) as kept:
         return {int(index): kept[index] for index in kept.files}
-
-
-def spread(indices: Sequence[int], count: int) -> list[int]:
-    """``count`` of ``indices``, evenly spread, without the first and the last."""
-    positions = np.linspace(0, len(indices) - 1, count + 2).round().astype(int)[1:-1]
-    return sorted({indices[position] for position in positions.tolist()}) if indices else []
 
 
 class _Timed:

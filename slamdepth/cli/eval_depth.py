@@ -118,16 +118,14 @@ def _judge(
     model: DepthModel, place: Place, indices: Sequence[int], quiet: bool
 ) -> tuple[DepthJudgement, list[SheetRow]]:
     """Evaluate one data set, and keep a few of its frames for the contact sheet."""
-    import numpy as np
     from rich.progress import track
 
     from slamdepth.depth.evaluate import judge_depth
-    from slamdepth.pipeline.depth_data import readable
+    from slamdepth.pipeline.depth_data import readable, shown
     from slamdepth.report.depth import SheetRow
     from slamdepth.types import DepthPrediction, Frame
 
-    spread = np.linspace(0, len(indices) - 1, _SHEET_FRAMES + 2).round().astype(int)[1:-1]
-    wanted = {indices[position] for position in spread.tolist()} if indices else set()
+    wanted = shown(indices, _SHEET_FRAMES)
     rows: list[SheetRow] = []
 
     def watch(frame: Frame, prediction: DepthPrediction) -> None:

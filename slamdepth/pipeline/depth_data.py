@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +123,12 @@ def thinned(place: Place, stride: int | None = None, max_frames: int | None = No
         return chosen
     spread = np.linspace(0, len(chosen) - 1, max_frames).round().astype(int)
     return [chosen[position] for position in spread.tolist()]
+
+
+def shown(indices: Sequence[int], count: int) -> set[int]:
+    """Up to ``count`` of ``indices`` to be drawn, evenly spread, without the first and the last."""
+    positions = np.linspace(0, len(indices) - 1, count + 2).round().astype(int)[1:-1]
+    return {indices[position] for position in positions.tolist()} if indices else set()
 
 
 def readable(place: Place, indices: Iterable[int]) -> Iterator[Frame]:

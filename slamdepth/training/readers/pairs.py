@@ -9,6 +9,7 @@ lines ``NNNNN x y z``, the pair's name and a unit vector in the camera frame (x 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -73,14 +74,23 @@ class PairPlace:
         Raises:
             DatasetError: there are none.
         """
-        kept = [
-            k for k, path in enumerate(self.images) if path.stem.isdigit() and first <= int(path.stem) <= last
-        ]
+        kept = self.numbered(first, last)
         if not kept:
             raise DatasetError(f"{self.images[0].parent}: no pair is numbered {first} to {last}")
+        return self.part(f"{self.name}[{first}-{last}]", kept)
+
+    def numbered(self, first: int, last: int) -> list[int]:
+        """Indices of the pairs numbered ``first`` to ``last``, both included."""
+        return [
+            k for k, path in enumerate(self.images) if path.stem.isdigit() and first <= int(path.stem) <= last
+        ]
+
+    def part(self, name: str, indices: Iterable[int]) -> PairPlace:
+        """The pairs ``indices``, as a place called ``name``."""
+        kept = list(indices)
         return replace(
             self,
-            name=f"{self.name}[{first}-{last}]",
+            name=name,
             images=tuple(self.images[k] for k in kept),
             depths=tuple(self.depths[k] for k in kept),
             gravities=tuple(self.gravities[k] for k in kept) if self.gravities else (),
