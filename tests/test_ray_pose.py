@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from wide_scene import CAMERA, STEP, errors, terrace
+from wide_scene import CAMERA, STEP, elsewhere, errors, half_wrong, terrace
 
 from slamdepth.frontend.pose import pose_from_scratch, refine_pose
 from slamdepth.frontend.ray_pose import RaySighting, pose_with_depths
@@ -67,24 +67,15 @@ def test_the_pose_errs_no_more_than_its_information_says() -> None:
 
 
 def test_matches_of_two_places_are_no_placement() -> None:
-    reference_px, sighting, _ = terrace(near=60, far=240)
-    seen = rays(sighting)
-    rng = np.random.default_rng(1)
-    elsewhere = RaySighting(
-        seen.points_w, seen.covariance_w, rng.uniform((0, 0), (640, 480), (300, 2)), seen.sigma_px,
-        seen.origin_w, seen.inflation,
-    )  # fmt: skip
-    assert pose_from_rays(CAMERA, np.eye(4), reference_px, elsewhere, seed=0, minimum=30) is None
+    reference_px, seen, _ = terrace(near=60, far=240)
+    other = rays(elsewhere(seen))
+    assert pose_from_rays(CAMERA, np.eye(4), reference_px, other, seed=0, minimum=30) is None
 
 
 def test_half_of_the_matches_may_be_wrong() -> None:
-    reference_px, sighting, T = terrace(near=150, far=150)
-    seen = rays(sighting)
-    rng = np.random.default_rng(1)
-    wrong = rng.random(300) < 0.5
-    px = np.where(wrong[:, None], rng.uniform((0, 0), (640, 480), (300, 2)), seen.px)
-    mixed = RaySighting(seen.points_w, seen.covariance_w, px, seen.sigma_px, seen.origin_w, seen.inflation)
-    found = pose_from_rays(CAMERA, np.eye(4), reference_px, mixed, seed=0, minimum=30)
+    reference_px, seen, T = terrace(near=150, far=150)
+    mixed, wrong = half_wrong(seen)
+    found = pose_from_rays(CAMERA, np.eye(4), reference_px, rays(mixed), seed=0, minimum=30)
     assert found is not None
     assert errors(found[0], T)[0] < 0.2 * np.linalg.norm(STEP[:3])
     assert np.mean(found[1][wrong]) < 0.15

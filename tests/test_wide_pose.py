@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from wide_scene import CAMERA, STEP, errors, terrace
+from wide_scene import CAMERA, STEP, elsewhere, errors, half_wrong, terrace
 
 from slamdepth.frontend.pose import pose_from_scratch, refine_pose
-from slamdepth.frontend.wide_pose import Sighting, directional_pose, pose_from_reference
+from slamdepth.frontend.wide_pose import directional_pose, pose_from_reference
 
 
 def test_a_city_predicted_at_three_metres_does_not_hide_the_step() -> None:
@@ -36,19 +36,13 @@ def test_depths_that_are_right_are_believed() -> None:
 @pytest.mark.parametrize("near", [0, 60])
 def test_matches_of_two_places_are_no_placement(near: int) -> None:
     reference_px, seen, _ = terrace(near=near, far=300 - near)
-    rng = np.random.default_rng(1)
-    elsewhere = Sighting(
-        seen.points_w, seen.covariance_w, rng.uniform((0, 0), (640, 480), (300, 2)), seen.sigma_px
-    )
-    assert pose_from_reference(CAMERA, np.eye(4), reference_px, elsewhere, seed=0, minimum=30) is None
+    other = elsewhere(seen)
+    assert pose_from_reference(CAMERA, np.eye(4), reference_px, other, seed=0, minimum=30) is None
 
 
 def test_half_of_the_matches_may_be_wrong() -> None:
     reference_px, seen, T = terrace(near=150, far=150)
-    rng = np.random.default_rng(1)
-    wrong = rng.random(300) < 0.5
-    px = np.where(wrong[:, None], rng.uniform((0, 0), (640, 480), (300, 2)), seen.px)
-    mixed = Sighting(seen.points_w, seen.covariance_w, px, seen.sigma_px)
+    mixed, wrong = half_wrong(seen)
     found = pose_from_reference(CAMERA, np.eye(4), reference_px, mixed, seed=0, minimum=30)
     assert found is not None
     assert errors(found[0], T)[0] < 0.15 * np.linalg.norm(STEP[:3])

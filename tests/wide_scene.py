@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from slamdepth.frontend.wide_pose import Sighting
@@ -39,3 +41,17 @@ def terrace(near: int, far: int, seed: int = 0) -> tuple[np.ndarray, Sighting, n
     points = backproject(CAMERA, reference_px, predicted_m)
     covariance = ray_covariance(CAMERA, reference_px, points, np.full(n, SIGMA_LOG), np.ones(n))
     return reference_px, Sighting(points, covariance, px, np.ones(n)), T
+
+
+def elsewhere(seen: Sighting) -> Sighting:
+    """The landmarks, matched with an image of another place."""
+    px = np.random.default_rng(1).uniform((0, 0), (640, 480), seen.px.shape)
+    return replace(seen, px=px)
+
+
+def half_wrong(seen: Sighting) -> tuple[Sighting, np.ndarray]:
+    """The landmarks with half of their matches wrong, and which are ``(N,)``."""
+    rng = np.random.default_rng(1)
+    wrong = rng.random(len(seen.px)) < 0.5
+    px = np.where(wrong[:, None], rng.uniform((0, 0), (640, 480), seen.px.shape), seen.px)
+    return replace(seen, px=px), wrong
