@@ -13,19 +13,19 @@ from typing import Any
 
 from slamdepth.errors import InputError
 from slamdepth.io import write_text
+from slamdepth.processor import instructions
 from slamdepth.report.environment import hardware, versions
 
 FORMAT = 2
 _DIGITS = 5  # significant ones; runs differ in the third
 _WIDTH = 110
-_INSTRUCTIONS = ("avx2", "avx512_f", "avx512_bf16", "amx_bf16")
 
 
 def environment() -> dict[str, Any]:
     """Versions, commit, hardware, and the load of the machine when the benchmark began.
 
-    ``hardware.instructions`` names those of AVX2, AVX-512 and bfloat16 that the processor has: they decide
-    how fast the network is.
+    ``hardware.instructions`` names those of AVX2, AVX-512 and bfloat16 that are used: they decide how fast
+    the network is.
     """
     found = versions()
     try:
@@ -35,18 +35,9 @@ def environment() -> dict[str, Any]:
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     return {
         "versions": found,
-        "hardware": {**hardware(), "instructions": _instructions()},
+        "hardware": {**hardware(), "instructions": list(instructions())},
         "load_average": load,
     }
-
-
-def _instructions() -> list[str]:
-    import torch
-
-    if not hasattr(torch.cpu, "get_capabilities"):
-        return []
-    has = torch.cpu.get_capabilities()
-    return [name for name in _INSTRUCTIONS if has.get(name)]
 
 
 def write_benchmark(path: Path, begun: dict[str, Any], settings: dict[str, Any], **content: Any) -> None:

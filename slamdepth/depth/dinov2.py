@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from slamdepth.depth.checkpoints import read_checkpoint
 from slamdepth.depth.layout import check_layout, dinov2_layout
+from slamdepth.processor import has_bfloat16
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -178,11 +179,7 @@ def working_type(device: str) -> torch.dtype:
     bfloat16 nearly halves the time of a prediction. It changes depth by about half a per cent, where the head
     errs by ten.
     """
-    if device != "cpu" or not hasattr(torch.cpu, "get_capabilities"):
-        return torch.float32
-    capabilities = torch.cpu.get_capabilities()
-    native = capabilities.get("avx512_bf16", False) or capabilities.get("amx_bf16", False)
-    return torch.bfloat16 if native else torch.float32
+    return torch.bfloat16 if device == "cpu" and has_bfloat16() else torch.float32
 
 
 def load_dinov2(path: Path, device: str = "cpu") -> DinoV2:
