@@ -140,6 +140,7 @@ class Frame:
             image, 0 where unknown; None where the sequence has none.
         gravity: ``(3,)`` unit direction of gravity in the camera's frame (x right, y down, z forward), as an
             accelerometer tells it; None where it is not known. Depth models may use it.
+        gravity_is_guess: True where depth models may correct ``gravity`` by what the image shows.
 
     Raises:
         CameraError: an image is not of the camera's size, or gravity is no unit direction (to 1 %).
@@ -151,6 +152,7 @@ class Frame:
     camera: Camera
     depth_m: NDArray[np.float32] | None = None
     gravity: NDArray[np.float64] | None = None
+    gravity_is_guess: bool = False
 
     def __post_init__(self) -> None:
         expected = (self.camera.height, self.camera.width, 3)

@@ -32,7 +32,7 @@ def test_what_most_images_agree_on_is_known_in_any_camera() -> None:
             estimate = np.cross(estimate, [0.0, 0.0, 1.0])
         consensus.add(R, estimate / np.linalg.norm(estimate), 0.8)
     R = rotations(1, seed=3)[0]
-    known = consensus.in_camera(R)
+    known, _ = consensus.in_camera(R)
     assert known is not None
     assert known @ (R.T @ GRAVITY_W) > np.cos(np.radians(3))
     in_world = consensus.in_world()
@@ -46,8 +46,8 @@ def test_nothing_is_known_before_enough_images_agree() -> None:
         few.add(R, R.T @ GRAVITY_W, 1.0)
         apart.add(R, R.T @ GRAVITY_W, 1.0)
         apart.add(R, R.T @ np.roll(GRAVITY_W, k % 2 + 1), 1.0)
-    assert few.in_camera(np.eye(3)) is None
-    assert apart.in_camera(np.eye(3)) is None
+    assert few.in_camera(np.eye(3)) == (None, True)
+    assert apart.in_camera(np.eye(3)) == (None, True)
     assert few.in_world() is apart.in_world() is None
 
 
@@ -55,7 +55,7 @@ def test_an_estimate_of_low_confidence_counts_less() -> None:
     consensus = GravityConsensus()
     for k, R in enumerate(rotations(10)):
         consensus.add(R, R.T @ (GRAVITY_W if k % 2 else np.roll(GRAVITY_W, 1)), 1.0 if k % 2 else 0.2)
-    known = consensus.in_camera(np.eye(3))
+    known, _ = consensus.in_camera(np.eye(3))
     assert known is not None
     assert known @ GRAVITY_W > 0.999
 
@@ -69,9 +69,11 @@ class GravityModel:
 
     def __init__(self) -> None:
         self.given: list[Floats | None] = []
+        self.is_asked: list[bool] = []
 
     def predict(self, frame: Frame) -> DepthPrediction:
         self.given.append(frame.gravity)
+        self.is_asked.append(frame.gravity_is_guess)
         gravity = GRAVITY_W if frame.gravity is None else frame.gravity
         return DepthPrediction(np.ones((24, 32), np.float32), self.kind, gravity=gravity, gravity_share=0.9)
 
@@ -97,7 +99,16 @@ def test_later_frames_are_given_what_earlier_ones_agreed_on() -> None:
             worker.request(one, known)
             worker.take(one)
     given = {k: gravity for k, gravity in enumerate(model.given) if gravity is not None}
-    assert list(given) == [6, 7, 8, 10, 11]  # six are estimated, then every fifth
+    assert list(given) == [6, 7, 8, 9, 10, 11]
+    assert [k for k, is_asked in enumerate(model.is_asked) if is_asked] == [
+        0,
+        1,
+        2,
+        3,
+        4,
+        5,
+        9,
+    ]  # every fifth
     assert all(np.allclose(gravity, GRAVITY_W) for gravity in given.values())
 
 

@@ -25,20 +25,20 @@ class GravityConsensus:
         self._confidences: list[float] = []
         self._queries = 0
 
-    def in_camera(self, R_world_camera: Floats) -> Floats | None:
-        """Unit direction of gravity ``(3,)`` in a camera's frame.
+    def in_camera(self, R_world_camera: Floats) -> tuple[Floats | None, bool]:
+        """Unit direction of gravity ``(3,)`` in a camera's frame, and whether the image should be asked too.
 
         Args:
             R_world_camera: ``(3, 3)``.
 
         Returns:
-            None where the image should be asked: before enough agree, and every fifth time.
+            No direction before enough images agree. The image is asked until then, and every fifth time.
         """
         self._queries += 1
         gravity_w = self.in_world()
-        if gravity_w is None or self._queries % _CHECK_EVERY == 0:
-            return None
-        return np.asarray(R_world_camera.T @ gravity_w)
+        if gravity_w is None:
+            return None, True
+        return np.asarray(R_world_camera.T @ gravity_w), self._queries % _CHECK_EVERY == 0
 
     def add(self, R_world_camera: Floats, gravity: Floats, confidence: float) -> None:
         """Add the estimate of one image.

@@ -125,7 +125,10 @@ def token_fields(directions: Tensor, focal_px: float, rows: int, columns: int) -
 
 
 def estimate_gravity(
-    scorer: GravityScorer, frames: Sequence[ManhattanFrame], encode: Callable[[float], EncodedImage]
+    scorer: GravityScorer,
+    frames: Sequence[ManhattanFrame],
+    encode: Callable[[float], EncodedImage],
+    guess_rad: float | None = None,
 ) -> GravityEstimate | None:
     """The most probable direction of gravity in an image; None where lines propose none.
 
@@ -134,11 +137,13 @@ def estimate_gravity(
 
     The scorer sees the image as taken. Where more than one direction is probable, it also sees the image
     rotated upright by each of the two most probable ones, because upright images are recognised better.
+    With a guess of the roll it sees the image rotated upright by that, and no other.
 
     Args:
         scorer: scores directions given the tokens.
         frames: the Manhattan frames whose axes are proposed.
         encode: the image rotated upright from a roll in radians, or from about that roll.
+        guess_rad: roll in radians that is expected; None where nothing is known.
     """
     if not frames:
         return None
@@ -146,13 +151,13 @@ def estimate_gravity(
     support = np.repeat([frame.support.sum() for frame in frames], 6)
     prior_angle = np.arccos(np.clip(candidates @ _PRIOR_GRAVITY, -1.0, 1.0))
     log_probability = (
-        _log_likelihood(scorer, encode(0.0), candidates)
+        _log_likelihood(scorer, encode(guess_rad or 0.0), candidates)
         + _SUPPORT_WEIGHT * support
         - prior_angle / _PRIOR_ANGLE_RAD
     )
-    modes = _modes(candidates, _normalised(log_probability))
-    if len(modes) > 1:
-        for mode in modes:
+    if guess_rad is None:
+        modes = _modes(candidates, _normalised(log_probability))
+        for mode in modes if len(modes) > 1 else ():
             log_probability = log_probability + _log_likelihood(scorer, encode(roll_rad(mode)), candidates)
     probability = _normalised(log_probability)
     is_near = candidates @ candidates.T > _COS_SAME

@@ -65,6 +65,7 @@ def mirror_image(frame: Frame, gravity: NDArray[np.float64] | None = None) -> Fr
         camera=frame.camera.mirrored(),
         depth_m=None,
         gravity=None if gravity is None else gravity * [-1.0, 1.0, 1.0],
+        gravity_is_guess=False,
     )
 
 

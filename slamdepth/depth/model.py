@@ -21,13 +21,12 @@ from slamdepth.depth.head import HeadEnsemble, load_head
 from slamdepth.depth.preprocess import (
     CANONICAL_FOCAL_PX,
     check_size,
-    focal_px_at,
     input_size,
     normalised,
     resize_rgb,
 )
 from slamdepth.depth.registry import register
-from slamdepth.depth.upright import roll_rad, rotated, rotated_back
+from slamdepth.depth.upright import UprightView, roll_rad
 from slamdepth.depth.vanishing import find_lines, manhattan_frames
 from slamdepth.io import sha256_of
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
@@ -36,9 +35,8 @@ from slamdepth.typing import Floats
 _SAME_ROLL_RAD = math.radians(8.0)
 """To score directions of gravity, an image rotated by so much less or more than asked for serves as well."""
 
-_UPRIGHT_RAD, _ROLLED_RAD = math.radians(4.0), math.radians(12.0)
-"""An image rolled by less than the first is predicted as taken, one rolled by more than the second as rotated
-upright. Between them the two predictions are blended, so that the depth of a video does not jump."""
+_UPRIGHT_RAD = math.radians(12.0)
+"""An image rolled by less is predicted as taken: rotated upright it is predicted no better."""
 
 
 @dataclass(frozen=True)
@@ -49,26 +47,27 @@ class _Encoded:
         image: tokens, input size and focal length.
         class_tokens: ``(1, taps, dim)``.
         pixels: ``(1, 3, rows, columns)``, ImageNet-normalised.
-        frame: the image at its own size, and its camera.
+        size: rows and columns of the image that was resized to the network's input.
+        view: how that image was rotated upright; None for the image as taken.
     """
 
     image: EncodedImage
     class_tokens: torch.Tensor
     pixels: torch.Tensor
-    frame: Frame
+    size: tuple[int, int]
+    view: UprightView | None = None
 
 
 class _Rotations:
     """A frame as taken and rotated upright from several rolls; each rotation is encoded once.
 
     Args:
-        frame: as taken.
-        encode: runs the backbone on a frame; the roll in radians that was undone is passed on.
+        encode: runs the backbone on a frame, rotated upright from a roll in radians.
     """
 
-    def __init__(self, frame: Frame, encode: Callable[[Frame, float], _Encoded]) -> None:
-        self._encode, self.as_taken = encode, encode(frame, 0.0)
-        self._encoded = [self.as_taken]
+    def __init__(self, encode: Callable[[float], _Encoded]) -> None:
+        self._encode = encode
+        self._encoded: list[_Encoded] = []
 
     def upright_from(self, roll: float, within_rad: float = _SAME_ROLL_RAD) -> _Encoded:
         """The image in which a camera of this ``roll``, in radians, is upright to ``within_rad``."""
@@ -76,17 +75,16 @@ class _Rotations:
             apart = roll - encoded.image.roll_rad
             if abs(math.atan2(math.sin(apart), math.cos(apart))) < within_rad:
                 return encoded
-        frame = self.as_taken.frame
-        image = rotated(frame.image_rgb, frame.camera, -roll)
-        self._encoded.append(self._encode(replace(frame, image_rgb=image, depth_m=None), roll))
+        self._encoded.append(self._encode(0.0 if abs(roll) < within_rad else roll))
         return self._encoded[-1]
 
 
 class Dinov2Depth:
     """DINOv2 tokens and a small trained head; see ``slamdepth/assets/dinov2_head.md``.
 
-    Where the head reads gravity, its direction is estimated first, from lines and tokens, unless the frame
-    has it. An image that is rolled is then rotated upright and encoded once more.
+    An image that is rolled is rotated upright. Where the frame has gravity, or a guess of it, that takes one
+    pass of the backbone; else gravity is estimated first, from lines and the tokens of at most three
+    rotations.
 
     Args:
         backbone: a ViT-S/14 in eval mode.
@@ -139,50 +137,53 @@ class Dinov2Depth:
     def predict(self, frame: Frame) -> DepthPrediction:
         """Depth in metres for every raw (not undistorted) pixel of ``frame``.
 
-        Gravity is estimated where the frame does not have it.
+        Gravity is estimated where the frame does not have it, or only guesses it.
 
         Raises:
             CameraError: the image is too small or too narrow for the network.
         """
         check_size(frame)
-        rotations = _Rotations(frame, self._encode)
-        if frame.gravity is not None:
+        rotations = _Rotations(lambda roll: self._encode(frame, roll))
+        if frame.gravity is not None and not frame.gravity_is_guess:
             return replace(self._upright(rotations, frame.gravity), gravity=frame.gravity, gravity_share=1.0)
         if (found := self._gravity(frame, rotations)) is None:
-            return self._upright(rotations, None)
+            return self._upright(rotations, frame.gravity)
         return replace(
             self._upright(rotations, found.gravity), gravity=found.gravity, gravity_share=found.share
         )
 
     def _encode(self, frame: Frame, roll: float) -> _Encoded:
-        height, width = frame.image_rgb.shape[:2]
+        image, camera, view = frame.image_rgb, frame.camera, None
+        if roll:
+            view = UprightView(camera, roll)
+            image = view.rotated(image)
+        height, width = image.shape[:2]
         rows, columns = input_size(height, width, self._head.shape.input_px)
-        pixels = normalised(resize_rgb(frame.image_rgb, rows, columns)[None], self.device)
+        pixels = normalised(resize_rgb(image, rows, columns)[None], self.device)
         with torch.inference_mode():
             tapped = self._backbone(pixels.to(self._dtype), self._head.shape.taps)
             tokens = torch.stack([grid for grid, _ in tapped], dim=1).float()
             class_tokens = torch.stack([token for _, token in tapped], dim=1).float()
-        focal_px = focal_px_at(frame.camera, rows, columns)
-        image = EncodedImage(tokens, (rows, columns), focal_px, roll)
-        return _Encoded(image, class_tokens, pixels, frame)
+        focal_px = math.sqrt(camera.fx * camera.fy * rows * columns / (height * width))
+        encoded = EncodedImage(tokens, (rows, columns), focal_px, roll)
+        return _Encoded(encoded, class_tokens, pixels, (height, width), view)
 
     def _gravity(self, frame: Frame, rotations: _Rotations) -> GravityEstimate | None:
         if self._head.gravity is None:
             return None
         frames = manhattan_frames(find_lines(frame.image_rgb, frame.camera), FRAMES)
-        return estimate_gravity(self._head.gravity, frames, lambda roll: rotations.upright_from(roll).image)
+        guess = None if frame.gravity is None else roll_rad(frame.gravity)
+        within = _SAME_ROLL_RAD if guess is None else _UPRIGHT_RAD
+        return estimate_gravity(
+            self._head.gravity, frames, lambda roll: rotations.upright_from(roll, within).image, guess
+        )
 
     def _upright(self, rotations: _Rotations, gravity: Floats | None) -> DepthPrediction:
         """The prediction of the rotation in which the camera is upright; ``gravity (3,)`` is as taken."""
-        as_taken = self._predict(rotations.as_taken, gravity)
         if gravity is None:
-            return as_taken
-        roll = roll_rad(gravity)
-        if (upright := rotations.upright_from(roll, _UPRIGHT_RAD)) is rotations.as_taken:
-            return as_taken
-        prediction = self._predict(upright, upright.image.rotated(gravity))
-        share = min(1.0, (abs(roll) - _UPRIGHT_RAD) / (_ROLLED_RAD - _UPRIGHT_RAD))
-        return rotated_back(prediction, as_taken, upright.frame.camera, upright.image.roll_rad, share)
+            return self._predict(rotations.upright_from(0.0), None)
+        encoded = rotations.upright_from(roll_rad(gravity), _UPRIGHT_RAD)
+        return self._predict(encoded, encoded.image.rotated(gravity))
 
     def _predict(self, encoded: _Encoded, gravity: Floats | None) -> DepthPrediction:
         """The head's prediction; ``gravity (3,)`` is in the frame of the encoded image."""
@@ -199,17 +200,17 @@ class Dinov2Depth:
                 image.tokens, encoded.class_tokens, encoded.pixels, field, focal_px
             )
             both = torch.stack([log_depth, sigma], dim=1)
-            size = encoded.frame.image_rgb.shape[:2]
-            full = F.interpolate(both, size=size, mode="bilinear", align_corners=False)[0]
+            full = F.interpolate(both, size=encoded.size, mode="bilinear", align_corners=False)[0]
             log_depth_full = full[0] + math.log(image.focal_px / CANONICAL_FOCAL_PX)
             values = log_depth_full.exp().cpu().numpy()
             sigma_log = full[1].cpu().numpy()
-        return DepthPrediction(
+        prediction = DepthPrediction(
             np.ascontiguousarray(values, dtype=np.float32),
             self.kind,
             np.ascontiguousarray(sigma_log, dtype=np.float32),
             scale_sigma_log=None if scale_sigma is None else float(scale_sigma[0]),
         )
+        return prediction if encoded.view is None else encoded.view.rotated_back(prediction)
 
 
 def _card(head: HeadEnsemble, weights: tuple[WeightsInfo, ...]) -> ModelCard:

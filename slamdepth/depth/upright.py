@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images rotated upright about their principal point, and predictions for them rotated back."""
+"""Images rotated upright about their centre, and predictions for them rotated back."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -11,14 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slamdepth.types import Camera, DepthPrediction
-from slamdepth.typing import Bools, Floats, Floats32
+from slamdepth.typing import Floats
 
-_SEAM = 0.05
-"""Width of the band in which two predictions are blended, as a share of the image's longer side."""
-
-_COARSE = 8
-_WIDER_WEIGHT = 0.02
-"""Weight of the wider mean, where that of known pixels is at most 1."""
+_BEYOND, _BEYOND_PER_SIDE = 0.15, 1.0
+"""Deviation of log depth where it is extrapolated, in addition to that of the nearest pixel seen: at the
+border of what was seen, and for each distance of the image's longer side from there."""
 
 
 def roll_rad(gravity: Floats) -> float:
@@ -31,69 +30,65 @@ def roll_rad(gravity: Floats) -> float:
     return float(np.arctan2(gravity[0], gravity[1]))
 
 
-def rotated(image_rgb: NDArray[np.uint8], camera: Camera, angle_rad: float) -> NDArray[np.uint8]:
-    """An image ``(H, W, 3)`` rotated about its principal point, its border mirrored.
+@dataclass(frozen=True)
+class UprightView:
+    """What is seen of a rolled camera's image after a rotation upright.
 
-    An image of a camera with a roll is upright after a rotation by minus that roll.
-    """
-    out = _warped(image_rgb, camera, angle_rad, cv2.INTER_LINEAR, cv2.BORDER_REFLECT_101)
-    return np.asarray(out, dtype=np.uint8)
+    The view has the image's area and pixel size, and the aspect of the rotated image's bounding box, so a
+    quarter turn of a landscape image is a portrait one. Corners of the image that lie outside are not seen.
 
-
-def rotated_back(
-    upright: DepthPrediction, as_taken: DepthPrediction, camera: Camera, roll_rad: float, share: float = 1.0
-) -> DepthPrediction:
-    """The prediction for an image rotated upright, as one for the image as taken.
-
-    Args:
-        upright: metres for every pixel of the image after a rotation by minus ``roll_rad``.
-        as_taken: metres for every pixel of the image as taken. It fills in where the rotated image was cut
-            off, brought to the scale that the rotated one has nearby, so that there is no step.
+    Attributes:
         camera: of the image as taken.
-        roll_rad: roll of the camera in radians.
-        share: weight of the rotated prediction where there are both, 0 to 1.
-
-    Returns:
-        Metres, and their uncertainty where both predictions have one.
+        roll_rad: its roll, which is undone.
     """
-    rotated_m = _back(upright.values, camera, roll_rad)
-    seen = rotated_m > 0
-    log_taken = np.log(as_taken.values.astype(np.float64))
-    change = np.log(rotated_m.astype(np.float64), out=log_taken.copy(), where=seen) - log_taken
-    inside = np.ones(seen.shape)
-    if not seen.all():
-        to_seam_px = cv2.distanceTransform(seen.astype(np.uint8), cv2.DIST_L2, 5)
-        inside = np.minimum(1.0, to_seam_px / (_SEAM * max(seen.shape)))
-        change = inside * change + (1 - inside) * _spread(change, seen)
-    values = np.exp(log_taken + share * change).astype(np.float32)
-    sigma = as_taken.sigma_log
-    if upright.sigma_log is not None and sigma is not None:
-        taken, rotated_sigma = sigma.astype(np.float64), _back(upright.sigma_log, camera, roll_rad)
-        sigma = (taken + share * inside * (rotated_sigma - taken)).astype(np.float32)
-    return replace(as_taken, values=values, sigma_log=sigma, scale_sigma_log=upright.scale_sigma_log)
 
+    camera: Camera
+    roll_rad: float
 
-def _spread(difference: Floats, known: Bools) -> Floats:
-    """``difference (H, W)`` smoothed, and extrapolated from the nearest pixels where it is not ``known``."""
-    rows, columns = difference.shape
-    small = (max(1, columns // _COARSE), max(1, rows // _COARSE))
-    weight = cv2.resize(known.astype(np.float64), small, interpolation=cv2.INTER_AREA)
-    weighted = cv2.resize(np.where(known, difference, 0.0), small, interpolation=cv2.INTER_AREA)
-    out = np.full(weight.shape, np.median(difference[known]))
-    for sigma in (small[0] / 4, small[0] / 12):
-        total = cv2.GaussianBlur(weight, (0, 0), sigma)
-        out = (cv2.GaussianBlur(weighted, (0, 0), sigma) + _WIDER_WEIGHT * out) / (total + _WIDER_WEIGHT)
-    return np.asarray(cv2.resize(out, (columns, rows), interpolation=cv2.INTER_LINEAR), dtype=np.float64)
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of the view."""
+        width, height = self.camera.width, self.camera.height
+        cosine, sine = abs(math.cos(self.roll_rad)), abs(math.sin(self.roll_rad))
+        columns, rows = width * cosine + height * sine, width * sine + height * cosine
+        scale = math.sqrt(width * height / (columns * rows))
+        return max(1, round(rows * scale)), max(1, round(columns * scale))
 
+    @cached_property
+    def _M_view_image(self) -> Floats:
+        """``(2, 3)`` affine map of pixels."""
+        rows, columns = self.size
+        centre = (self.camera.width - 1) / 2, (self.camera.height - 1) / 2
+        M = np.asarray(cv2.getRotationMatrix2D(centre, -math.degrees(self.roll_rad), 1.0), dtype=np.float64)
+        M[:, 2] += (columns - 1) / 2 - centre[0], (rows - 1) / 2 - centre[1]
+        return M
 
-def _back(values: Floats32, camera: Camera, angle_rad: float) -> Floats32:
-    """A map of the rotated image in the pixels of the image as taken; 0 where the former was cut off."""
-    out = _warped(values, camera, angle_rad, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
-    return np.asarray(out, dtype=np.float32)
+    def rotated(self, image_rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The view of an image ``(H, W, 3)``; mirrored where it reaches beyond the image's border."""
+        out = cv2.warpAffine(
+            image_rgb, self._M_view_image, self.size[::-1], flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REFLECT_101,
+        )  # fmt: skip
+        return np.asarray(out, dtype=np.uint8)
 
+    def rotated_back(self, upright: DepthPrediction) -> DepthPrediction:
+        """A prediction for the view, as one for every pixel of the image as taken.
 
-def _warped(
-    image: NDArray[Any], camera: Camera, angle_rad: float, interpolation: int, border: int
-) -> NDArray[Any]:
-    M = cv2.getRotationMatrix2D((camera.cx, camera.cy), np.degrees(angle_rad), 1.0)
-    return np.asarray(cv2.warpAffine(image, M, image.shape[1::-1], flags=interpolation, borderMode=border))
+        Pixels that the view does not show get the depth of the nearest one that it does, and the larger
+        deviation of a guess.
+        """
+        values = self._back(upright.values, cv2.BORDER_REPLICATE)
+        sigma = upright.sigma_log
+        if sigma is not None:
+            sigma = self._back(sigma, cv2.BORDER_REPLICATE)
+            is_seen = self._back(np.ones(self.size, np.uint8), cv2.BORDER_CONSTANT)
+            if not is_seen.all():
+                to_seen_px = cv2.distanceTransform(1 - is_seen, cv2.DIST_L2, 5)
+                beyond = _BEYOND + _BEYOND_PER_SIDE * to_seen_px / max(is_seen.shape)
+                sigma = np.where(is_seen, sigma, np.hypot(sigma, beyond)).astype(np.float32)
+        return replace(upright, values=values, sigma_log=sigma)
+
+    def _back(self, values: NDArray[Any], border: int) -> NDArray[Any]:
+        size = self.camera.width, self.camera.height
+        flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        return np.asarray(cv2.warpAffine(values, self._M_view_image, size, flags=flags, borderMode=border))

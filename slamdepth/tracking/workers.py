@@ -132,9 +132,9 @@ class DepthWorker:
         if gravity is None or frame.gravity is not None:
             prediction = self._model.predict(frame)
         else:
-            known = gravity.consensus.in_camera(gravity.R_world_camera)
-            prediction = self._model.predict(replace(frame, gravity=known))
-            if known is None and prediction.gravity is not None:
+            known, is_asked = gravity.consensus.in_camera(gravity.R_world_camera)
+            prediction = self._model.predict(replace(frame, gravity=known, gravity_is_guess=is_asked))
+            if is_asked and prediction.gravity is not None:
                 gravity.consensus.add(gravity.R_world_camera, prediction.gravity, prediction.gravity_share)
         if self._with_uncertainty or prediction.is_sensor:
             return prediction
