@@ -19,6 +19,12 @@ from slamdepth.report.environment import hardware, versions
 FORMAT = 2
 _DIGITS = 5  # significant ones; runs differ in the third
 _WIDTH = 110
+_SHOWN = {
+    "avx2": "AVX2",
+    "avx512_f": "AVX-512",
+    "avx512_bf16": "bfloat16 by AVX-512",
+    "amx_bf16": "bfloat16 by AMX",
+}
 
 
 def environment() -> dict[str, Any]:
@@ -38,6 +44,17 @@ def environment() -> dict[str, Any]:
         "hardware": {**hardware(), "instructions": list(instructions())},
         "load_average": load,
     }
+
+
+def machine_line(begun: dict[str, Any]) -> str:
+    """What the figures of :func:`environment` ``begun`` were measured on, for the head of a table."""
+    machine, used = begun["hardware"], begun["hardware"].get("instructions", [])
+    names = [shown for name, shown in _SHOWN.items() if name in used] or ["instructions unknown"]
+    if "avx2" in used and not any("bf16" in name for name in used):
+        names.append("no bfloat16")
+    commit = str(begun["versions"].get("commit") or begun["versions"].get("slamdepth"))[:9]
+    gpu = f", {machine['gpu']}" if machine.get("gpu") else ""
+    return f"{machine['cores']} cores of {machine['cpu']} ({', '.join(names)}){gpu}; {commit}"
 
 
 def write_benchmark(path: Path, begun: dict[str, Any], settings: dict[str, Any], **content: Any) -> None:

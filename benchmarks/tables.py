@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.markdown import markdown_table
+from benchmarks.record import machine_line
 from benchmarks.summary import METRICS, Metric
 
 if TYPE_CHECKING:
@@ -36,16 +37,17 @@ def by_sequence(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str
 
 
 def rich_tables(benchmark: Mapping[str, Any]) -> list[Table]:
-    """A table for each sequence, with the notes below it, for a terminal."""
+    """A table for each sequence, with the machine above it and the notes below, for a terminal."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
     tables = []
+    machine = machine_line(benchmark["environment"])
     for sequence, rows in by_sequence(benchmark["rows"]).items():
         notes = [f"{_name(row)}: {note}" for row in rows for note in row["notes"]]
         table = Table(
-            title=Text(sequence, style="bold"),
+            title=Text.assemble((sequence, "bold"), "\n", (machine, "dim")),
             title_justify="left",
             box=box.SIMPLE,
             caption=Text("\n".join(notes)),
@@ -61,8 +63,9 @@ def rich_tables(benchmark: Mapping[str, Any]) -> list[Table]:
 
 
 def markdown(benchmark: Mapping[str, Any]) -> str:
-    """A table for each sequence, for ``docs/benchmarks.md``."""
-    parts = [
+    """The machine, and a table for each sequence, for ``docs/benchmarks.md``."""
+    parts = [f"{machine_line(benchmark['environment'])}."]
+    parts += [
         f"### {sequence}\n\n{markdown_table(*_headings_and_lines(rows))}"
         for sequence, rows in by_sequence(benchmark["rows"]).items()
     ]

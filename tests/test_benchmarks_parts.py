@@ -225,7 +225,10 @@ def test_median_and_extremes_over_the_good_runs() -> None:
 def test_a_table_shows_median_and_spread_and_trouble() -> None:
     row = {**entry("ours", tracked=1.0, fps=30.0), "spread": {"fps": [29.0, 33.0]}}
     lost = {**entry("theirs"), "status": "not installed", "message": "not installed: pip install '.[bench]'"}
-    text = tables.markdown({"rows": [row, lost]})
+    machine = {"cores": 2, "cpu": "A", "gpu": None, "instructions": ["avx2"]}
+    begun = {"hardware": machine, "versions": {"commit": "0123456789abc"}}
+    text = tables.markdown({"environment": begun, "rows": [row, lost]})
+    assert text.startswith("2 cores of A (AVX2, no bfloat16); 012345678.\n")
     assert "| ours | sensor | 100.0 | 30.0 ±2.0 |" in text
     assert "| theirs: not installed: pip install '.[bench]' | sensor | - | - |" in text
 

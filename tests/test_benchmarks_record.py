@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import same_trajectories
-from benchmarks.record import compact_json, environment, read_benchmark, write_benchmark
+from benchmarks.record import compact_json, environment, machine_line, read_benchmark, write_benchmark
 from benchmarks.same_trajectories import differences
 from slamdepth.errors import InputError
 
@@ -25,6 +25,21 @@ def test_what_is_written_is_read_with_rounded_figures(tmp_path: Path) -> None:
     assert read["rows"] == [{"name": "a {b}  c", "figures": {"ate": 0.012346, "none": None}, "spread": {}}]
     assert read["settings"] == {"factor": 0.123456789}
     assert {"cpu", "cores", "instructions"} <= read["environment"]["hardware"].keys()
+
+
+@pytest.mark.parametrize(
+    ("used", "shown"),
+    [
+        ([], "(instructions unknown)"),
+        (["avx2", "avx512_f"], "(AVX2, AVX-512, no bfloat16)"),
+        (["avx2", "avx512_f", "avx512_bf16"], "(AVX2, AVX-512, bfloat16 by AVX-512)"),
+    ],
+)
+def test_a_table_says_what_it_was_measured_on(used: list[str], shown: str) -> None:
+    begun = environment()
+    begun["hardware"] |= {"cpu": "A", "cores": 4, "gpu": None, "instructions": used}
+    begun["versions"]["commit"] = "0123456789abc"
+    assert machine_line(begun) == f"4 cores of A {shown}; 012345678"
 
 
 def test_text_is_the_same_json_on_few_lines() -> None:
