@@ -7,7 +7,8 @@ import numpy as np
 
 from slamdepth.typing import Floats
 
-_MIN_ESTIMATES = 6
+_MIN_ESTIMATES = 6  # for a direction to be known
+_MIN_GUESSES = 2  # for a direction to be tried first
 _MIN_SHARE = 0.7  # of all confidence that must agree
 _AGREEMENT = np.cos(np.radians(15.0))
 _CHECK_EVERY = 5  # images: the direction is estimated again even where it is known
@@ -32,13 +33,12 @@ class GravityConsensus:
             R_world_camera: ``(3, 3)``.
 
         Returns:
-            No direction before enough images agree. The image is asked until then, and every fifth time.
+            No direction before two images agree. The image is asked before six do, and every fifth time.
         """
         self._queries += 1
-        gravity_w = self.in_world()
-        if gravity_w is None:
-            return None, True
-        return np.asarray(R_world_camera.T @ gravity_w), self._queries % _CHECK_EVERY == 0
+        gravity_w = self._agreed(_MIN_GUESSES)
+        is_asked = self.in_world() is None or self._queries % _CHECK_EVERY == 0
+        return None if gravity_w is None else np.asarray(R_world_camera.T @ gravity_w), is_asked
 
     def add(self, R_world_camera: Floats, gravity: Floats, confidence: float) -> None:
         """Add the estimate of one image.
@@ -62,7 +62,10 @@ class GravityConsensus:
 
     def in_world(self) -> Floats | None:
         """The unit direction ``(3,)`` in the world that most agree on; None before enough do."""
-        if len(self._estimates_w) < _MIN_ESTIMATES:
+        return self._agreed(_MIN_ESTIMATES)
+
+    def _agreed(self, minimum: int) -> Floats | None:
+        if len(self._estimates_w) < minimum:
             return None
         estimates, confidences = np.stack(self._estimates_w), np.array(self._confidences)
         alike = estimates @ estimates.T > _AGREEMENT
