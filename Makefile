@@ -19,6 +19,8 @@ demo: install
 
 test: install-dev
 	$(BIN)/pytest --numprocesses auto --maxprocesses 4
+	SLAMDEPTH_COMPILED=0 $(BIN)/pytest tests/test_features.py tests/test_matching.py tests/test_metric.py \
+		tests/test_moving_things.py tests/test_pose.py tests/test_tracker.py
 
 lint: install-dev
 	$(BIN)/ruff check .

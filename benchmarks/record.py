@@ -54,7 +54,8 @@ def machine_line(begun: dict[str, Any]) -> str:
         names.append("no bfloat16")
     commit = str(begun["versions"].get("commit") or begun["versions"].get("slamdepth"))[:9]
     gpu = f", {machine['gpu']}" if machine.get("gpu") else ""
-    return f"{machine['cores']} cores of {machine['cpu']} ({', '.join(names)}){gpu}; {commit}"
+    numba = f", numba {begun['versions']['numba']}" if begun["versions"].get("numba") else ""
+    return f"{machine['cores']} cores of {machine['cpu']} ({', '.join(names)}){gpu}{numba}; {commit}"
 
 
 def write_benchmark(path: Path, begun: dict[str, Any], settings: dict[str, Any], **content: Any) -> None:

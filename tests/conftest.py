@@ -13,6 +13,14 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))  # benchmarks is not i
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before PyTorch loads
 
 
+@pytest.fixture(scope="session", autouse=True)
+def compiled_loops() -> None:
+    """Where numba is installed, no test waits for it to compile."""
+    from slamdepth.frontend import compiled
+
+    compiled.load()
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Folder of real sequences; skips where it is absent."""

@@ -16,7 +16,19 @@ import pytest
 
 import slamdepth
 
-HEAVY = ("torch", "open3d", "gtsam", "cv2", "evo", "matplotlib", "kiss_icp", "scipy", "onnx", "pydantic")
+HEAVY = (
+    "torch",
+    "open3d",
+    "gtsam",
+    "numba",
+    "cv2",
+    "evo",
+    "matplotlib",
+    "kiss_icp",
+    "scipy",
+    "onnx",
+    "pydantic",
+)
 
 
 def loaded_by(code: str) -> set[str]:

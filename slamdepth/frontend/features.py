@@ -18,7 +18,7 @@ import numpy as np
 from slamdepth.config import FeatureConfig
 from slamdepth.errors import ConfigError, TrackingError, WeightsError
 from slamdepth.frontend.matching import PixelGrid, match_all
-from slamdepth.frontend.metric import ORB, DescriptorMetric
+from slamdepth.frontend.metric import ORB, DescriptorMetric, has_words, whole_words
 from slamdepth.io import sha256_of
 from slamdepth.registry import Registry
 from slamdepth.types import Camera, WeightsInfo
@@ -49,7 +49,12 @@ class ScaleLevels:
 
     def sigma_px(self, octave: Ints) -> Floats:
         """Standard deviations ``(N,)`` of keypoints in pixels; one pixel at the finest level."""
-        return self.factor ** (self.growth * octave.astype(np.float64))
+        return self.sigmas_px.take(octave)
+
+    @cached_property
+    def sigmas_px(self) -> Floats:
+        """:meth:`sigma_px` of each level, ``(count,)``."""
+        return self.factor ** (self.growth * np.arange(self.count, dtype=np.float64))
 
 
 class ImageMatcher(Protocol):
@@ -103,6 +108,11 @@ class Features:
     def grid(self) -> PixelGrid:
         """``px`` in a grid of cells; cached, as a keyframe is searched many times."""
         return PixelGrid(self.px)
+
+    @cached_property
+    def words(self) -> NDArray[np.uint64] | None:
+        """Descriptors as 64-bit words ``(N, W)``; None where another distance than Hamming's counts."""
+        return whole_words(self.descriptors).view(np.uint64) if has_words(self.metric) else None
 
     @property
     def place_descriptors(self) -> NDArray[np.uint8]:

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slamdepth.frontend.metric import FARTHEST, ORB, DescriptorMetric
+from slamdepth.frontend.compiled import loops
+from slamdepth.frontend.metric import FARTHEST, ORB, DescriptorMetric, has_words, whole_words
 from slamdepth.typing import Floats, Ints
 
 if TYPE_CHECKING:
@@ -23,21 +25,39 @@ class PixelGrid:
     Args:
         px: ``(N, 2)`` pixels.
         cell_px: edge of a cell.
+
+    Attributes:
+        low: ``(2,)`` lowest pixel; cell: edge of a cell; columns, rows: number of cells.
+        order: ``(N,)`` pixels by cell; starts: ``(columns * rows + 1,)`` where each cell starts in it.
+        They do not exist where there are no pixels.
     """
 
     def __init__(self, px: Floats, cell_px: float = 8.0) -> None:
-        self._count = len(px)
+        self._px = px
         if len(px) == 0:
             return
-        self._low = px.min(axis=0)
-        self._cell = max(cell_px, float((px.max(axis=0) - self._low).max()) / _MAX_CELLS)
-        cell = ((px - self._low) / self._cell).astype(np.int64)
-        self._columns, self._rows = (int(n) + 1 for n in cell.max(axis=0))
-        flat = cell[:, 1] * self._columns + cell[:, 0]
-        self._order = np.argsort(flat, kind="stable")
-        self._u, self._v = px[self._order].T.copy()
-        counts = np.bincount(flat, minlength=self._columns * self._rows)
-        self._starts = np.concatenate([[0], np.cumsum(counts)])
+        if (fast := loops()) is not None:
+            found = fast.matching.grid(px, cell_px, _MAX_CELLS)
+            self.low, self.cell, self.columns, self.rows, self.order, self.starts = found
+            return
+        self.low = px.min(axis=0)
+        self.cell = max(cell_px, float((px.max(axis=0) - self.low).max()) / _MAX_CELLS)
+        cell = ((px - self.low) / self.cell).astype(np.int64)
+        self.columns, self.rows = (int(n) + 1 for n in cell.max(axis=0))
+        flat = cell[:, 1] * self.columns + cell[:, 0]
+        self.order = np.argsort(flat, kind="stable")
+        counts = np.bincount(flat, minlength=self.columns * self.rows)
+        self.starts = np.concatenate([[0], np.cumsum(counts)])
+
+    @property
+    def cells(self) -> tuple[Floats, float, tuple[int, int], Ints, Ints]:
+        """The attributes, as :func:`slamdepth.frontend.compiled.matching.match` takes them."""
+        return self.low, self.cell, (self.columns, self.rows), self.order, self.starts
+
+    @cached_property
+    def _sorted_px(self) -> Floats:
+        """``px`` by cell, ``(2, N)``."""
+        return np.ascontiguousarray(self._px[self.order].T)
 
     def pairs_within(
         self, query_px: Floats, radius_px: Floats, half_px: Floats | None = None
@@ -51,27 +71,28 @@ class PixelGrid:
         Returns:
             Two index arrays of equal length, sorted by query.
         """
-        if len(query_px) == 0 or self._count == 0:
+        if len(query_px) == 0 or len(self._px) == 0:
             empty = np.zeros(0, dtype=np.int64)
             return empty, empty
         # of each query: the columns and rows of cells that its circle may touch
         half = radius_px[:, None] if half_px is None else np.minimum(half_px, radius_px[:, None])
-        centre = query_px - self._low
-        limit = np.array([self._columns, self._rows]) - 1
-        first = np.clip(np.floor((centre - half) / self._cell), 0, limit + 1).astype(np.int64)
-        last = np.clip(np.floor((centre + half) / self._cell), -1, limit).astype(np.int64)
+        centre = query_px - self.low
+        limit = np.array([self.columns, self.rows]) - 1
+        first = np.clip(np.floor((centre - half) / self.cell), 0, limit + 1).astype(np.int64)
+        last = np.clip(np.floor((centre + half) / self.cell), -1, limit).astype(np.int64)
         height = np.where(last[:, 0] >= first[:, 0], np.maximum(last[:, 1] - first[:, 1] + 1, 0), 0)
         # a row of cells is one run of the sorted pixels
         query, offset = _expand(height)
-        row = (first[query, 1] + offset) * self._columns
-        begin, end = self._starts[row + first[query, 0]], self._starts[row + last[query, 0] + 1]
+        row = (first[query, 1] + offset) * self.columns
+        begin, end = self.starts[row + first[query, 0]], self.starts[row + last[query, 0] + 1]
         count = end - begin
         at = _expand_from(begin, count)
         u, v = query_px.T
-        du = np.repeat(u.take(query), count) - self._u.take(at)
-        dv = np.repeat(v.take(query), count) - self._v.take(at)
+        sorted_u, sorted_v = self._sorted_px
+        du = np.repeat(u.take(query), count) - sorted_u.take(at)
+        dv = np.repeat(v.take(query), count) - sorted_v.take(at)
         near = np.flatnonzero(du * du + dv * dv <= np.repeat((radius_px * radius_px).take(query), count))
-        return np.repeat(query, count).take(near), self._order.take(at.take(near))
+        return np.repeat(query, count).take(near), self.order.take(at.take(near))
 
 
 def _expand(lengths: Ints) -> tuple[Ints, Ints]:
@@ -136,6 +157,11 @@ def match_all(
     empty = np.zeros(0, dtype=np.int64)
     if len(a) == 0 or len(b) < 2:
         return empty, empty, empty
+    if (fast := loops()) is not None and has_words(metric):
+        columns = np.ascontiguousarray(whole_words(b).view(np.uint64).T)
+        words = whole_words(a).view(np.uint64)
+        found: tuple[Ints, Ints, Ints] = fast.matching.mutual(words, columns, metric.max_distance, ratio)
+        return found
     table = metric.table(a, b)
     best = table.argmin(axis=1)
     rows = np.arange(len(a))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from slamdepth.frontend.compiled import loops
 from slamdepth.typing import Floats32, Ints
 
 if TYPE_CHECKING:
@@ -121,6 +122,11 @@ ORB = Hamming(32, 64, 50)
 """The metric of ORB's 256 bits."""
 
 
+def has_words(metric: DescriptorMetric) -> bool:
+    """Whether the distance is the number of bits in which two descriptors differ."""
+    return isinstance(metric, Hamming) and 8 * metric.size <= FARTHEST
+
+
 def whole_words(descriptors: Bytes) -> Bytes:
     """Binary descriptors ``(..., D)`` padded with zeros to a multiple of 8 bytes."""
     rest = -descriptors.shape[-1] % 8
@@ -153,6 +159,9 @@ def hamming_nearest(a: Bytes, b: Bytes) -> NDArray[np.intp]:
 
     Ties go to the lowest index. Memory does not grow with ``N`` times ``M``.
     """
+    if (fast := loops()) is not None and len(b):
+        columns = np.ascontiguousarray(whole_words(b).view(np.uint64).T)
+        return np.asarray(fast.matching.nearest(whole_words(a).view(np.uint64), columns), dtype=np.intp)
     index = np.empty(len(a), dtype=np.intp)
     for start, distances in _hamming_blocks(a, b):
         index[start : start + len(distances)] = distances.argmin(axis=1)

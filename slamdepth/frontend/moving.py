@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slamdepth.frontend.compiled import loops
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.matching import best_matches
 from slamdepth.frontend.pose import CELLS, cells_of
@@ -17,6 +18,7 @@ _RATIO = 0.8
 _NEAREST = 0.1  # of the scene's distance: nothing static is taken to be nearer
 _SIGMAS, _POSE_PX = 3.0, 1.5  # that a static feature may be off its line, and for the error of the poses
 _FEWEST_PAIRS = 50
+_NEVER, _LEVELS = -100, 256  # a level that no feature is near to, and more levels than any extractor has
 _FEWEST_TOGETHER = 5  # in a cell of the image; with fewer, wrong matches point the same way by chance
 
 
@@ -80,6 +82,29 @@ def _matched(
 ) -> tuple[Ints, Ints]:
     """Free features of both images, matched near where the motion of the camera takes them."""
     expected = _seen_at(camera, before.px[free_before], T_now_before, distance)
+    words_before, words, fast = before.words, now.words, loops()
+    if fast is not None and words_before is not None and words is not None and len(now) and len(free_before):
+        free_level = np.full(len(now), _NEVER)
+        free_level[free_now] = now.octave[free_now]
+        reach = _REACH * camera.width
+        b, n, _ = fast.matching.match(
+            expected,
+            np.zeros((len(expected), 2, 2)),
+            before.octave[free_before],
+            words_before[free_before],
+            *now.grid.cells,
+            now.px,
+            free_level,
+            words,
+            np.full(_LEVELS, 1.0),
+            reach * (1.0 + 1e-9),  # the ellipse is open, the circle of the largest distance closed
+            reach,
+            0.0,
+            1.0,
+            now.metric.strict_distance,
+            _RATIO,
+        )
+        return free_before[b], n
     b, n = now.grid.pairs_within(expected, np.full(len(expected), _REACH * camera.width))
     b = free_before[b]
     is_free = np.zeros(len(now), dtype=bool)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from slamdepth.frontend.compiled import loops
 from slamdepth.geometry import CHI2_2DOF_95, reprojection_errors, se3_exp
 from slamdepth.types import Camera
 from slamdepth.typing import Floats, Ints
@@ -117,6 +118,24 @@ def refine_pose(
         rounds: outliers are re-classified after each; Huber kernel in all but the last.
         gate: squared whitened residual beyond which a match is an outlier.
     """
+    if (fast := loops()) is not None:
+        ok, T, active, H = fast.pose.refine(
+            np.array(T_camera_world),
+            points_w,
+            covariance_w,
+            px,
+            sigma_px,
+            (camera.fx, camera.fy, camera.cx, camera.cy),
+            rounds,
+            iterations,
+            gate,
+            HUBER,
+            _NEAREST_M,
+            (_CONVERGED, _ROUGHLY_CONVERGED),
+            _REWHITEN,
+        )
+        if ok:
+            return PoseEstimate(T, active, H)
     match = _Matches(camera, points_w.T.copy(), covariance_w, px.T.copy(), sigma_px)
     T = T_camera_world.copy()
     active = np.ones(len(points_w), dtype=bool)
@@ -184,19 +203,13 @@ def pose_covariance(
     """
     if len(points_w) < _FEWEST_MATCHES:
         return None
-    match = _Matches(camera, points_w.T.copy(), covariance_w, px.T.copy(), sigma_px)
-    points_c = match.seen_from(T_camera_world)
-    whitening = match.whitening(T_camera_world, points_c)
-    J = match.derivatives(points_c, whitening)
-    r = match.residual(points_c, whitening)
-    H = J.reshape(6, -1) @ J.reshape(6, -1).T
+    H, sums = _equations_by_cell(camera, T_camera_world, points_w, covariance_w, px, sigma_px)
     # translation and rotation differ by orders of magnitude: the condition of the scaled matrix counts
     unit = 1.0 / np.sqrt(np.maximum(H.diagonal(), 1e-300))
     values, vectors = np.linalg.eigh(H * unit[:, None] * unit)
     if not values[0] > _SINGULAR:
         return None
     inverse = (vectors / values) @ vectors.T * unit[:, None] * unit
-    sums = _sums_by_cell(camera, match.px, J[:, 0] * r[0] + J[:, 1] * r[1])
     cells = len(sums)
     scatter = sums.T @ sums * (cells / max(cells - 1.0, 1.0))
     covariance = _INFLATION * (sampled * inverse + inverse @ scatter @ inverse)
@@ -204,6 +217,37 @@ def pose_covariance(
     R = np.zeros((6, 6))
     R[:3, :3] = R[3:, 3:] = T_camera_world[:3, :3].T
     return np.asarray(R @ covariance @ R.T)
+
+
+def _equations_by_cell(
+    camera: Camera,
+    T_camera_world: Floats,
+    points_w: Floats,
+    covariance_w: Floats,
+    px: Floats,
+    sigma_px: Floats,
+) -> tuple[Floats, Floats]:
+    """Hessian ``(6, 6)`` of all matches, and sums ``(cells, 6)`` of their gradients by cell of the image."""
+    if (fast := loops()) is not None:
+        found: tuple[Floats, Floats] = fast.pose.equations_by_cell(
+            np.array(T_camera_world),
+            points_w,
+            covariance_w,
+            px,
+            sigma_px,
+            (camera.fx, camera.fy, camera.cx, camera.cy),
+            (camera.width, camera.height),
+            CELLS,
+            _NEAREST_M,
+        )
+        return found
+    match = _Matches(camera, points_w.T.copy(), covariance_w, px.T.copy(), sigma_px)
+    points_c = match.seen_from(T_camera_world)
+    whitening = match.whitening(T_camera_world, points_c)
+    J = match.derivatives(points_c, whitening)
+    r = match.residual(points_c, whitening)
+    sums = _sums_by_cell(camera, match.px, J[:, 0] * r[0] + J[:, 1] * r[1])
+    return J.reshape(6, -1) @ J.reshape(6, -1).T, sums
 
 
 def _sums_by_cell(camera: Camera, px: Floats, values: Floats) -> Floats:

@@ -13,6 +13,7 @@ from pathlib import Path
 PACKAGES = (
     "numpy",
     "scipy",
+    "numba",
     "opencv-python-headless",
     "torch",
     "gtsam",

@@ -3,26 +3,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features, ScaleLevels
-from slamdepth.frontend.matching import best_matches
 from slamdepth.frontend.pose import (
     PoseEstimate,
     corner_deviation_px,
-    pixel_covariance,
     pose_from_scratch,
     refine_pose,
 )
 from slamdepth.frontend.ray_pose import RaySighting, pose_with_depths
 from slamdepth.frontend.ray_start import pose_from_rays
 from slamdepth.frontend.wide_pose import directional_pose, pose_from_reference
-from slamdepth.geometry import CHI2_2DOF_95, CHI2_2DOF_99, project, transform
-from slamdepth.mapping.map_view import NEAREST_M, MapView
+from slamdepth.geometry import CHI2_2DOF_95
+from slamdepth.mapping.map_view import MapView
 from slamdepth.mapping.placement import PlacedBy, Placement
+from slamdepth.tracking.landmark_search import SearchWindow, Visible, match_landmarks, visible_landmarks
 from slamdepth.tracking.view_change import ViewChange
 from slamdepth.types import Camera
 from slamdepth.typing import Floats, Ints
@@ -31,23 +30,6 @@ _FEWEST_SURE = 40
 _LEAST_SURE_SHARE = 0.07
 POSE_PX, FARTHEST_PX = 4.0, 30.0
 """What a pose errs by at most where the local map is searched, and how far any search there goes."""
-
-
-@dataclass(frozen=True)
-class Visible:
-    """Landmarks expected in an image.
-
-    Attributes:
-        ids: ``(N,)``.
-        px: ``(N, 2)`` undistorted pixels.
-        covariance_px: ``(N, 2, 2)`` of those, from the landmark alone.
-        octave: ``(N,)`` pyramid level it should be found at.
-    """
-
-    ids: Ints
-    px: Floats
-    covariance_px: Floats
-    octave: Ints
 
 
 class Localiser:
@@ -71,33 +53,7 @@ class Localiser:
 
     def expected(self, T_camera_world: Floats, ids: Ints) -> Visible:
         """Which of the landmarks ``ids (N,)`` a camera at ``T_camera_world (4, 4)`` should see, and where."""
-        camera, landmarks = self._camera, self._map.landmarks
-        points_w = landmarks.position_w[ids]
-        points_c = transform(T_camera_world, points_w)
-        px, z = project(camera, points_c)
-        margin = 8.0
-        u, v = px.T
-        at = np.flatnonzero(
-            (z > NEAREST_M)
-            & (u > -margin)
-            & (u < camera.width + margin)
-            & (v > -margin)
-            & (v < camera.height + margin)
-        )
-        ids, points_c, px = ids[at], points_c[at], px[at]
-        offset = points_w[at] - (-T_camera_world[:3, :3].T @ T_camera_world[:3, 3])
-        x, y, z = offset.T
-        distance = np.maximum(np.sqrt(x * x + y * y + z * z), 1e-9)
-        ok = np.einsum("ni,ni->n", offset, landmarks.direction_w[ids]) > 0.5 * distance
-        step = np.log(landmarks.distance_m[ids] / distance) / np.log(self._levels.factor)
-        octave = np.rint(landmarks.octave[ids] + step).astype(np.int64)
-        ok &= (octave >= -1) & (octave <= self._levels.count)
-        at = np.flatnonzero(ok)
-        ids, octave = ids[at], np.minimum(np.maximum(octave[at], 0), self._levels.count - 1)
-        covariance = pixel_covariance(
-            camera, T_camera_world, points_c[at], landmarks.covariance_w[ids], np.zeros(len(at))
-        )
-        return Visible(ids, px[at], covariance, octave)
+        return visible_landmarks(self._camera, self._levels, self._map.landmarks, T_camera_world, ids)
 
     def search(
         self,
@@ -122,28 +78,16 @@ class Localiser:
         Returns:
             ``(landmark ids, feature indices, descriptor distances)``, one to one.
         """
-        pose_px = radius_px * self._levels.sigma_px(visible.octave)
-        S00, S01, S11 = (visible.covariance_px[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-        half_trace = 0.5 * (S00 + S11)
-        largest = half_trace + np.sqrt(np.maximum(half_trace**2 - (S00 * S11 - S01**2), 0.0))
-        reach = np.minimum(pose_px + sigmas * np.sqrt(largest), max_px)
-        # the ellipse of the pose's error plus the point's own, a du^2 + b du dv + c dv^2 < 1
-        along_u, along_v = S00 + pose_px**2 / CHI2_2DOF_99, S11 + pose_px**2 / CHI2_2DOF_99
-        scale = CHI2_2DOF_99 * (along_u * along_v - S01 * S01)
-        a, b, c = along_v / scale, -2.0 * S01 / scale, along_u / scale
-        box = np.sqrt(CHI2_2DOF_99 * np.column_stack([along_u, along_v]))
-        q, t = features.grid.pairs_within(visible.px, reach, box)
-        ok = np.flatnonzero(np.abs(features.octave.take(t) - visible.octave.take(q)) <= 1)
-        q, t = q.take(ok), t.take(ok)
-        du = features.px[:, 0].take(t) - visible.px[:, 0].take(q)
-        dv = features.px[:, 1].take(t) - visible.px[:, 1].take(q)
-        ok = np.flatnonzero((a.take(q) * du + b.take(q) * dv) * du + c.take(q) * dv * dv < 1.0)
-        q, t = q.take(ok), t.take(ok)
         metric = features.metric
-        distance = metric.between(self._map.landmarks.descriptor[visible.ids[q]], features.descriptors[t])
-        limit = metric.strict_distance if is_strict else metric.max_distance
-        q, t, distance = best_matches(q, t, distance, max_distance=limit, ratio=ratio)
-        return visible.ids[q], t, distance
+        return match_landmarks(
+            visible,
+            self._map.landmarks,
+            features,
+            self._levels,
+            SearchWindow(radius_px, max_px, sigmas),
+            max_distance=metric.strict_distance if is_strict else metric.max_distance,
+            ratio=ratio,
+        )
 
     def track(self, features: Features, T_guess: Floats, recent_ids: Ints) -> Placement | None:
         """Place a frame near a guess.

@@ -11,6 +11,7 @@ from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.metric import metric_model
 from slamdepth.errors import TrackingError
+from slamdepth.frontend.compiled import load
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.preparation import Preparation, Prepared
 from slamdepth.geometry import invert
@@ -186,7 +187,9 @@ class Tracker:
 
 
 def _load_libraries() -> None:
-    """Import what the first keyframes would import: a second's pause in the middle of tracking."""
+    """Load what the first keyframes would load: a second's pause in the middle of tracking."""
     import gtsam  # noqa: F401
     import scipy.linalg
     import scipy.sparse  # noqa: F401
+
+    load()
