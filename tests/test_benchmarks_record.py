@@ -38,7 +38,9 @@ def test_what_is_written_is_read_with_rounded_figures(tmp_path: Path) -> None:
 def test_a_table_says_what_it_was_measured_on(used: list[str], shown: str) -> None:
     begun = environment()
     begun["hardware"] |= {"cpu": "A", "cores": 4, "gpu": None, "instructions": used}
-    begun["versions"]["commit"] = "0123456789abc"
+    begun["versions"] |= {"commit": "0123456789abc", "numba": "0.61"}
+    assert machine_line(begun) == f"4 cores of A {shown}, numba 0.61; 012345678"
+    del begun["versions"]["numba"]
     assert machine_line(begun) == f"4 cores of A {shown}; 012345678"
 
 
