@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops of the tracker compiled by numba, where it is installed (``pip install 'slamdepth[fast]'``).
+"""Loops of the tracker compiled by numba, where it can be imported.
 
 Each has a twin in NumPy or OpenCV that is used without numba. They take one core and release the interpreter
-lock. The first run compiles them, which takes half a minute; later ones read them from numba's cache on disk.
+lock. The first run compiles them, which takes some 15 seconds; later ones read them from numba's cache on disk.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ def loops() -> Loops | None:
 def load() -> None:
     """Compile what tracking needs, or read it from the cache, so that no frame waits for it."""
     if (fast := loops()) is not None:
+        log.info("loading compiled loops (the first run compiles them, for some 15 seconds)")
         fast.visible.load()
         fast.matching.load()
         fast.pose.load()
