@@ -16,6 +16,12 @@ def seeded_depth_model(name: str, config: Config) -> DepthModel:
         WeightsError: its weights are missing.
     """
     seed_everything(config.seed)
-    model = create_depth_model(name, device=config.device, seed=config.seed, weights=config.depth.weights)
+    model = create_depth_model(
+        name,
+        device=config.device,
+        seed=config.seed,
+        weights=config.depth.weights,
+        precision=config.depth.precision,
+    )
     seed_torch(config.seed)
     return model

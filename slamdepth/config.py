@@ -19,6 +19,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from slamdepth.errors import ConfigError
 from slamdepth.fiducial import MarkerSpec
 
+Precision = Literal["auto", "float32", "bfloat16", "int8"]
+"""What numbers a network computes in."""
+
 
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -112,6 +115,11 @@ class DepthConfig(_Section):
     )
     weights: str | None = Field(
         None, min_length=1, description="its weights file; null takes the shipped or cached one"
+    )
+    precision: Precision = Field(
+        "auto",
+        description="numbers that the backbone of 'dinov2' computes in: float32, bfloat16, int8, or 'auto': "
+        "bfloat16 where the processor multiplies it natively, else int8 where it has AVX2",
     )
     min_m: float = Field(0.1, gt=0, description="nearer depth is dropped")
     max_m: float = Field(10.0, gt=0, description="farther depth is dropped")

@@ -220,12 +220,21 @@ class DepthPrediction:
 
 @dataclass(frozen=True)
 class WeightsInfo:
-    """Where the numbers of a model come from."""
+    """Where the numbers of a model come from.
+
+    Attributes:
+        name: of the file.
+        sha256: of the file, or of its tensors.
+        trained_on: the data.
+        licence: of the weights.
+        precision: what the network computes in, such as "int8"; empty where it has no choice.
+    """
 
     name: str
     sha256: str
     trained_on: str
     licence: str
+    precision: str = ""
 
 
 class TrackingStatus(str, Enum):

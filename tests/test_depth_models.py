@@ -90,11 +90,17 @@ def test_prediction_is_deterministic_and_scales_with_the_focal_length() -> None:
 
 def test_the_default_model_names_its_training_data() -> None:
     head = WeightsInfo("head", "ab", "six places", "free")
-    model = Dinov2Depth(DinoV2(24, 2, 3, grid=5), HeadEnsemble(HeadShape((0, 1), 24, 16, 1, 8)), (head,))
+    model = Dinov2Depth(
+        DinoV2(24, 2, 3, grid=5),
+        HeadEnsemble(HeadShape((0, 1), 24, 16, 1, 8)),
+        (WeightsInfo("vit", "cd", "the web", "free"), head),
+        precision="float32",
+    )
     assert model.card == ModelCard("dinov2", DepthKind.METRIC, (238, 322), 280.0, "free", "six places")
     assert card_of(create_depth_model("sensor")) is None
     assert model_lines(model) == [
         "dinov2: metric depth; trained at 238x322 pixels of focal length 280 px",
+        "weights vit, sha256 cd; free; trained on the web; computes in float32",
         "weights head, sha256 ab; free; trained on six places",
     ]
     assert model_lines(create_depth_model("sensor")) == ["sensor: metric depth"]
@@ -215,7 +221,7 @@ def test_shipped_model_on_a_real_image(data_dir: Path) -> None:
 def test_the_default_takes_a_head_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     asked: list[Path | None] = []
 
-    def load(*, head: Path | None, device: str) -> Dinov2Depth:
+    def load(*, head: Path | None, device: str, precision: str) -> Dinov2Depth:
         asked.append(head)
         return tiny_model()
 

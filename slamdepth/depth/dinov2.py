@@ -53,7 +53,7 @@ class _Mlp(nn.Module):
         return out
 
 
-class _LayerScale(nn.Module):
+class LayerScale(nn.Module):
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.gamma = nn.Parameter(torch.ones(dim))
@@ -62,15 +62,15 @@ class _LayerScale(nn.Module):
         return x * self.gamma
 
 
-class _Block(nn.Module):
+class Block(nn.Module):
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(dim, eps=1e-6)
         self.attn = _Attention(dim, heads)
-        self.ls1 = _LayerScale(dim)
+        self.ls1: nn.Module = LayerScale(dim)
         self.norm2 = nn.LayerNorm(dim, eps=1e-6)
         self.mlp = _Mlp(dim)
-        self.ls2 = _LayerScale(dim)
+        self.ls2: nn.Module = LayerScale(dim)
 
     def forward(self, x: Tensor) -> Tensor:
         x = x + self.ls1(self.attn(self.norm1(x)))
@@ -107,7 +107,7 @@ class DinoV2(nn.Module):
         self.cls_token = nn.Parameter(torch.zeros(1, 1, dim))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + grid * grid, dim))
         self.patch_embed = _PatchEmbed(dim, patch)
-        self.blocks = nn.ModuleList(_Block(dim, heads) for _ in range(depth))
+        self.blocks = nn.ModuleList(Block(dim, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(dim, eps=1e-6)
         self._resized: dict[tuple[int, int], Tensor] = {}
 

@@ -18,7 +18,11 @@ def metric_model(model: DepthModel | None, config: Config) -> DepthModel:
         WeightsError: its weights are not there.
     """
     model = model or create_depth_model(
-        config.depth.name, device=config.device, seed=config.seed, weights=config.depth.weights
+        config.depth.name,
+        device=config.device,
+        seed=config.seed,
+        weights=config.depth.weights,
+        precision=config.depth.precision,
     )
     check_metric(model)
     return model

@@ -12,12 +12,14 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from slamdepth.config import Precision
 from slamdepth.depth import weights as store
 from slamdepth.depth.card import ModelCard
-from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
+from slamdepth.depth.dinov2 import DinoV2, load_dinov2
 from slamdepth.depth.gravity_direction import FRAMES, EncodedImage, GravityEstimate, estimate_gravity
 from slamdepth.depth.gravity_field import gravity_field
 from slamdepth.depth.head import HeadEnsemble, load_head
+from slamdepth.depth.precision import chosen_precision, with_precision
 from slamdepth.depth.preprocess import (
     CANONICAL_FOCAL_PX,
     check_size,
@@ -89,8 +91,9 @@ class Dinov2Depth:
     Args:
         backbone: a ViT-S/14 in eval mode.
         head: heads that read its tokens.
-        weights: what the two were read from.
+        weights: what the two were read from, in this order.
         device: where both run.
+        precision: what the backbone computes in. int8 and bfloat16 change it in place.
     """
 
     name = "dinov2"
@@ -102,21 +105,28 @@ class Dinov2Depth:
         head: HeadEnsemble,
         weights: tuple[WeightsInfo, ...],
         device: str = "cpu",
+        precision: Precision = "auto",
     ) -> None:
-        self.weights = weights
+        chosen = chosen_precision(precision, device)
+        self.weights = (*(replace(info, precision=chosen) for info in weights[:1]), *weights[1:])
         self.card = _card(head, weights)
         self.device = device
-        self._dtype = working_type(device)
-        self._backbone = backbone.to(device, self._dtype)
+        self._backbone, self._dtype = with_precision(backbone, chosen, device)
         self._head = head.to(device)
 
     @classmethod
     def load(
-        cls, *, backbone: Path | None = None, head: Path | None = None, device: str = "cpu"
+        cls,
+        *,
+        backbone: Path | None = None,
+        head: Path | None = None,
+        device: str = "cpu",
+        precision: Precision = "auto",
     ) -> Dinov2Depth:
         """Read the backbone (default: the cached one) and the head (default: the shipped one).
 
         Raises:
+            ConfigError: the precision cannot be had here.
             WeightsError: one line: what is missing or damaged, and what to do.
         """
         head_file = head or store.head_path()
@@ -132,7 +142,7 @@ class Dinov2Depth:
                 about.get("licence", "unknown"),
             ),
         )
-        return cls(load_dinov2(backbone_file, device), network, infos, device)
+        return cls(load_dinov2(backbone_file, device), network, infos, device, precision)
 
     def predict(self, frame: Frame) -> DepthPrediction:
         """Depth in metres for every raw (not undistorted) pixel of ``frame``.
@@ -221,10 +231,12 @@ def _card(head: HeadEnsemble, weights: tuple[WeightsInfo, ...]) -> ModelCard:
 
 
 @register("dinov2")
-def create(*, device: str = "cpu", seed: int = 0, weights: Path | None = None) -> Dinov2Depth:
+def create(
+    *, device: str = "cpu", seed: int = 0, weights: Path | None = None, precision: Precision = "auto"
+) -> Dinov2Depth:
     """The model with the cached backbone and the head in ``weights``, by default the shipped one.
 
     Nothing in it is random: ``seed`` has no effect.
     """
     del seed
-    return Dinov2Depth.load(head=weights, device=device)
+    return Dinov2Depth.load(head=weights, device=device, precision=precision)

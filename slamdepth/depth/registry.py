@@ -14,6 +14,7 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
+from slamdepth.config import Precision
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.checkpoints import check_device, check_device_name
 from slamdepth.depth.hub_models import BY_NAME
@@ -30,6 +31,11 @@ ENTRY_POINTS = "slamdepth.depth_models"
 AUTO = "auto"
 _ONNX = "onnx:"
 _MIRRORED = "mirrored:"
+_ANY_PRECISION = "auto"
+_LACKS = {
+    "weights": "takes no weights file",
+    "precision": "has no choice of precision; leave out depth.precision",
+}
 
 _MODULES = {
     AUTO: __name__,  # stands for one of the others, see chosen_name
@@ -82,7 +88,12 @@ def chosen_name(*, has_weights: bool = False) -> str:
 
 
 def create_depth_model(
-    name: str, *, device: str = "cpu", seed: int = 0, weights: str | Path | None = None
+    name: str,
+    *,
+    device: str = "cpu",
+    seed: int = 0,
+    weights: str | Path | None = None,
+    precision: Precision = "auto",
 ) -> DepthModel:
     """Build the depth model called ``name``.
 
@@ -92,20 +103,25 @@ def create_depth_model(
         device: where its network runs: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, checked for every model.
         seed: for models with something random; the ones here have nothing.
         weights: its weights file; default: by its official name from the cache folder.
+        precision: what its network computes in. Only the embedded model has a choice.
 
     Raises:
-        ConfigError: no such model; lists the names. Or the device is not there, the model
-            takes no weights file, or a plug-in is broken.
+        ConfigError: no such model; lists the names. Or the device or the precision is not there, the model
+            takes no weights file or has no choice of precision, or a plug-in is broken.
         WeightsError: its weights are missing, damaged or of another layout.
     """
     if name.startswith(_MIRRORED):
         from slamdepth.depth.mirrored import MirroredDepth
 
-        looked_through = name.removeprefix(_MIRRORED)
-        return MirroredDepth(create_depth_model(looked_through, device=device, seed=seed, weights=weights))
+        return MirroredDepth(
+            create_depth_model(
+                name.removeprefix(_MIRRORED), device=device, seed=seed, weights=weights, precision=precision
+            )
+        )
     if name.startswith(_ONNX):
         if weights is not None:
             raise ConfigError(f"depth model '{name}' names its file already; leave out the weights")
+        _refuse_precision(name, precision)
         check_device_name(device)  # ONNX Runtime has CUDA devices of its own, without PyTorch's
         from slamdepth.depth.onnx_model import create
 
@@ -116,8 +132,9 @@ def create_depth_model(
     if is_hub_name(name):
         from slamdepth.depth.hub import HubDepth
 
+        _refuse_precision(name, precision)
         return HubDepth.load(name, weights=None if weights is None else Path(weights), device=device)
-    model = _call(name, MODELS.get(name, depth_model_names), device, seed, weights)
+    model = _call(name, MODELS.get(name, depth_model_names), device, seed, weights, precision)
     plugin = MODELS.plugin(name)
     if plugin is not None and not (isinstance(model, DepthModel) and isinstance(model.kind, DepthKind)):
         raise ConfigError(
@@ -127,10 +144,22 @@ def create_depth_model(
     return model
 
 
-def _call(name: str, factory: Factory, device: str, seed: int, weights: str | Path | None) -> DepthModel:
-    if weights is None:
-        return factory(device=device, seed=seed)
+def _call(
+    name: str, factory: Factory, device: str, seed: int, weights: str | Path | None, precision: Precision
+) -> DepthModel:
+    options: dict[str, object] = {}
+    if weights is not None:
+        options["weights"] = Path(weights)
+    if precision != _ANY_PRECISION:
+        options["precision"] = precision
     parameters = inspect.signature(factory).parameters
-    if "weights" not in parameters and not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-        raise ConfigError(f"depth model '{name}' takes no weights file")
-    return factory(device=device, seed=seed, weights=Path(weights))
+    takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    for option in options:
+        if option not in parameters and not takes_all:
+            raise ConfigError(f"depth model '{name}' {_LACKS[option]}")
+    return factory(device=device, seed=seed, **options)
+
+
+def _refuse_precision(name: str, precision: Precision) -> None:
+    if precision != _ANY_PRECISION:
+        raise ConfigError(f"depth model '{name}' {_LACKS['precision']}")

@@ -149,7 +149,11 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite)
     seed_everything(config.seed)
     given = create_depth_model(
-        config.depth.name, device=config.device, seed=config.seed, weights=config.depth.weights
+        config.depth.name,
+        device=config.device,
+        seed=config.seed,
+        weights=config.depth.weights,
+        precision=config.depth.precision,
     )
     if is_sensor(given):
         if not dataset.has_depth:

@@ -103,6 +103,7 @@ def model_lines(model: DepthModel) -> list[str]:
     for info in model.weights:
         lines.append(
             f"weights {info.name}, sha256 {info.sha256}; {info.licence}; trained on {info.trained_on}"
+            + (f"; computes in {info.precision}" if info.precision else "")
         )
     return lines
 

@@ -68,7 +68,13 @@ def about_folder(
             "native_size": None if card is None else list(card.native_size),
             "native_focal_px": None if card is None else card.native_focal_px,
             "weights": [
-                {"name": w.name, "sha256": w.sha256, "trained_on": w.trained_on, "licence": w.licence}
+                {
+                    "name": w.name,
+                    "sha256": w.sha256,
+                    "trained_on": w.trained_on,
+                    "licence": w.licence,
+                    "precision": w.precision,
+                }
                 for w in model.weights
             ],
         },
