@@ -54,6 +54,13 @@ def test_an_int8_layer_is_close_to_the_same_layer_in_float32(shift: float) -> No
 
 
 @needs_int8
+def test_large_weights_next_to_one_another_do_not_saturate() -> None:
+    weight = torch.ones(4, 64) * torch.tensor([[1.0], [-1.0], [0.5], [-2.0]])
+    out = Int8Linear(weight, torch.zeros(4))(torch.ones(2, 64))
+    torch.testing.assert_close(out, weight.sum(dim=1).expand(2, -1), rtol=0.02, atol=0.0)
+
+
+@needs_int8
 def test_an_int8_layer_takes_an_input_of_zeros() -> None:
     layer = torch.nn.Linear(16, 8)
     out = Int8Linear(layer.weight, layer.bias)(torch.zeros(3, 16))

@@ -82,6 +82,7 @@ def test_summary_has_the_promised_keys_and_values() -> None:
         "sha256": "ab" * 32,
         "trained_on": "some rooms",
         "licence": "Apache-2.0",
+        "precision": "",
     }
     assert summary["settings"] == Config().model_dump(mode="json")
     assert summary["notes"] == ["3 rows dropped", "the tracker's <note>"]

@@ -37,7 +37,7 @@ class Int8Linear(nn.Module):
     def __init__(self, weight: Tensor, bias: Tensor) -> None:
         super().__init__()
         weight = weight.detach().float()
-        scale = weight.abs().amax(dim=1).clamp_min(torch.finfo(torch.float32).tiny) / _WEIGHT_LEVELS
+        scale = _largest(weight).clamp_min(torch.finfo(torch.float32).tiny) / _WEIGHT_LEVELS
         rounded = (weight / scale[:, None]).round().to(torch.int8)
         self._outputs = len(weight)
         self._packed = torch.ops.onednn.qlinear_prepack(rounded, None)
@@ -58,6 +58,16 @@ class Int8Linear(nn.Module):
             1.0, 0, torch.float32, "none", [], "",
         )  # fmt: skip
         return out.reshape(*x.shape[:-1], self._outputs)
+
+
+def _largest(weight: Tensor) -> Tensor:
+    """Largest absolute value in each row, or sum of two neighbours of one sign, if that is larger.
+
+    AVX2 adds the products of two neighbouring weights in 16 bits, which saturate. They cannot where the two
+    weights together have at most 128 levels, because 128 * 255 < 2^15.
+    """
+    pairs = [part[:, :-1] + part[:, 1:] for part in (weight.clamp_min(0.0), -weight.clamp_max(0.0))]
+    return torch.cat([weight.abs(), *pairs], dim=1).amax(dim=1)
 
 
 def check_int8(device: str) -> None:
