@@ -22,6 +22,7 @@ def seeded_depth_model(name: str, config: Config) -> DepthModel:
         seed=config.seed,
         weights=config.depth.weights,
         precision=config.depth.precision,
+        input_px=config.depth.input_px,
     )
     seed_torch(config.seed)
     return model

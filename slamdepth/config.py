@@ -121,6 +121,13 @@ class DepthConfig(_Section):
         description="numbers that the backbone of 'dinov2' computes in: float32, bfloat16, int8, or 'auto': "
         "bfloat16 where the processor multiplies it natively, else int8 where it has AVX2",
     )
+    input_px: int | None = Field(
+        None,
+        ge=8_000,
+        le=250_000,
+        description="rows times columns of the network input of 'dinov2', in the image's aspect; fewer "
+        "pixels take less time and blur edges; null: as trained",
+    )
     min_m: float = Field(0.1, gt=0, description="nearer depth is dropped")
     max_m: float = Field(10.0, gt=0, description="farther depth is dropped")
     uncertainty: bool = Field(

@@ -221,7 +221,7 @@ def test_shipped_model_on_a_real_image(data_dir: Path) -> None:
 def test_the_default_takes_a_head_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     asked: list[Path | None] = []
 
-    def load(*, head: Path | None, device: str, precision: str) -> Dinov2Depth:
+    def load(*, head: Path | None, device: str, precision: str, input_px: int | None) -> Dinov2Depth:
         asked.append(head)
         return tiny_model()
 

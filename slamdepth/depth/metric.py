@@ -23,6 +23,7 @@ def metric_model(model: DepthModel | None, config: Config) -> DepthModel:
         seed=config.seed,
         weights=config.depth.weights,
         precision=config.depth.precision,
+        input_px=config.depth.input_px,
     )
     check_metric(model)
     return model

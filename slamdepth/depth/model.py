@@ -94,6 +94,9 @@ class Dinov2Depth:
         weights: what the two were read from, in this order.
         device: where both run.
         precision: what the backbone computes in. int8 and bfloat16 change it in place.
+        input_px: rows times columns of the input; None: as the head was trained. The network predicts the
+            same depth for the same view in other pixels, so the focal length counts in pixels of the
+            trained size.
     """
 
     name = "dinov2"
@@ -106,6 +109,7 @@ class Dinov2Depth:
         weights: tuple[WeightsInfo, ...],
         device: str = "cpu",
         precision: Precision = "auto",
+        input_px: int | None = None,
     ) -> None:
         chosen = chosen_precision(precision, device)
         self.weights = (*(replace(info, precision=chosen) for info in weights[:1]), *weights[1:])
@@ -113,6 +117,8 @@ class Dinov2Depth:
         self.device = device
         self._backbone, self._dtype = with_precision(backbone, chosen, device)
         self._head = head.to(device)
+        self._input_px = input_px or head.shape.input_px
+        self._to_trained_px = math.sqrt(head.shape.input_px / self._input_px)
 
     @classmethod
     def load(
@@ -122,6 +128,7 @@ class Dinov2Depth:
         head: Path | None = None,
         device: str = "cpu",
         precision: Precision = "auto",
+        input_px: int | None = None,
     ) -> Dinov2Depth:
         """Read the backbone (default: the cached one) and the head (default: the shipped one).
 
@@ -142,7 +149,7 @@ class Dinov2Depth:
                 about.get("licence", "unknown"),
             ),
         )
-        return cls(load_dinov2(backbone_file, device), network, infos, device, precision)
+        return cls(load_dinov2(backbone_file, device), network, infos, device, precision, input_px)
 
     def predict(self, frame: Frame) -> DepthPrediction:
         """Depth in metres for every raw (not undistorted) pixel of ``frame``.
@@ -168,7 +175,7 @@ class Dinov2Depth:
             view = UprightView(camera, roll)
             image = view.rotated(image)
         height, width = image.shape[:2]
-        rows, columns = input_size(height, width, self._head.shape.input_px)
+        rows, columns = input_size(height, width, self._input_px)
         pixels = normalised(resize_rgb(image, rows, columns)[None], self.device)
         with torch.inference_mode():
             tapped = self._backbone(pixels.to(self._dtype), self._head.shape.taps)
@@ -205,13 +212,14 @@ class Dinov2Depth:
                 field = gravity_field(
                     direction, torch.tensor([image.focal_px], device=self.device), *image.size
                 )
-            focal_px = torch.tensor([image.focal_px], device=self.device)
+            trained_focal_px = image.focal_px * self._to_trained_px
+            focal_px = torch.tensor([trained_focal_px], device=self.device)
             log_depth, sigma, scale_sigma = self._head(
                 image.tokens, encoded.class_tokens, encoded.pixels, field, focal_px
             )
             both = torch.stack([log_depth, sigma], dim=1)
             full = F.interpolate(both, size=encoded.size, mode="bilinear", align_corners=False)[0]
-            log_depth_full = full[0] + math.log(image.focal_px / CANONICAL_FOCAL_PX)
+            log_depth_full = full[0] + math.log(trained_focal_px / CANONICAL_FOCAL_PX)
             values = log_depth_full.exp().cpu().numpy()
             sigma_log = full[1].cpu().numpy()
         prediction = DepthPrediction(
@@ -232,11 +240,16 @@ def _card(head: HeadEnsemble, weights: tuple[WeightsInfo, ...]) -> ModelCard:
 
 @register("dinov2")
 def create(
-    *, device: str = "cpu", seed: int = 0, weights: Path | None = None, precision: Precision = "auto"
+    *,
+    device: str = "cpu",
+    seed: int = 0,
+    weights: Path | None = None,
+    precision: Precision = "auto",
+    input_px: int | None = None,
 ) -> Dinov2Depth:
     """The model with the cached backbone and the head in ``weights``, by default the shipped one.
 
     Nothing in it is random: ``seed`` has no effect.
     """
     del seed
-    return Dinov2Depth.load(head=weights, device=device, precision=precision)
+    return Dinov2Depth.load(head=weights, device=device, precision=precision, input_px=input_px)

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import inspect
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Container, Iterable
 from pathlib import Path
+from typing import Any
 
 from slamdepth.config import Precision
 from slamdepth.depth.base import DepthModel
@@ -31,10 +32,10 @@ ENTRY_POINTS = "slamdepth.depth_models"
 AUTO = "auto"
 _ONNX = "onnx:"
 _MIRRORED = "mirrored:"
-_ANY_PRECISION = "auto"
 _LACKS = {
     "weights": "takes no weights file",
     "precision": "has no choice of precision; leave out depth.precision",
+    "input_px": "has no choice of input size; leave out depth.input_px",
 }
 
 _MODULES = {
@@ -94,6 +95,7 @@ def create_depth_model(
     seed: int = 0,
     weights: str | Path | None = None,
     precision: Precision = "auto",
+    input_px: int | None = None,
 ) -> DepthModel:
     """Build the depth model called ``name``.
 
@@ -104,10 +106,12 @@ def create_depth_model(
         seed: for models with something random; the ones here have nothing.
         weights: its weights file; default: by its official name from the cache folder.
         precision: what its network computes in. Only the embedded model has a choice.
+        input_px: rows times columns of its network's input; None: as trained. Only the embedded model has a
+            choice.
 
     Raises:
         ConfigError: no such model; lists the names. Or the device or the precision is not there, the model
-            takes no weights file or has no choice of precision, or a plug-in is broken.
+            takes no weights file or has no such choice, or a plug-in is broken.
         WeightsError: its weights are missing, damaged or of another layout.
     """
     if name.startswith(_MIRRORED):
@@ -115,13 +119,19 @@ def create_depth_model(
 
         return MirroredDepth(
             create_depth_model(
-                name.removeprefix(_MIRRORED), device=device, seed=seed, weights=weights, precision=precision
+                name.removeprefix(_MIRRORED),
+                device=device,
+                seed=seed,
+                weights=weights,
+                precision=precision,
+                input_px=input_px,
             )
         )
+    options = _given(weights, precision, input_px)
     if name.startswith(_ONNX):
         if weights is not None:
             raise ConfigError(f"depth model '{name}' names its file already; leave out the weights")
-        _refuse_precision(name, precision)
+        _check_options(name, options, ())
         check_device_name(device)  # ONNX Runtime has CUDA devices of its own, without PyTorch's
         from slamdepth.depth.onnx_model import create
 
@@ -132,9 +142,13 @@ def create_depth_model(
     if is_hub_name(name):
         from slamdepth.depth.hub import HubDepth
 
-        _refuse_precision(name, precision)
+        _check_options(name, options, ("weights",))
         return HubDepth.load(name, weights=None if weights is None else Path(weights), device=device)
-    model = _call(name, MODELS.get(name, depth_model_names), device, seed, weights, precision)
+    factory = MODELS.get(name, depth_model_names)
+    parameters = inspect.signature(factory).parameters
+    takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    _check_options(name, options, options if takes_all else parameters)
+    model = factory(device=device, seed=seed, **options)
     plugin = MODELS.plugin(name)
     if plugin is not None and not (isinstance(model, DepthModel) and isinstance(model.kind, DepthKind)):
         raise ConfigError(
@@ -144,22 +158,17 @@ def create_depth_model(
     return model
 
 
-def _call(
-    name: str, factory: Factory, device: str, seed: int, weights: str | Path | None, precision: Precision
-) -> DepthModel:
-    options: dict[str, object] = {}
-    if weights is not None:
-        options["weights"] = Path(weights)
-    if precision != _ANY_PRECISION:
-        options["precision"] = precision
-    parameters = inspect.signature(factory).parameters
-    takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+def _given(weights: str | Path | None, precision: Precision, input_px: int | None) -> dict[str, Any]:
+    """The arguments of a factory that differ from their defaults."""
+    given = {
+        "weights": None if weights is None else Path(weights),
+        "precision": None if precision == "auto" else precision,
+        "input_px": input_px,
+    }
+    return {option: value for option, value in given.items() if value is not None}
+
+
+def _check_options(name: str, options: Iterable[str], accepted: Container[str]) -> None:
     for option in options:
-        if option not in parameters and not takes_all:
+        if option not in accepted:
             raise ConfigError(f"depth model '{name}' {_LACKS[option]}")
-    return factory(device=device, seed=seed, **options)
-
-
-def _refuse_precision(name: str, precision: Precision) -> None:
-    if precision != _ANY_PRECISION:
-        raise ConfigError(f"depth model '{name}' {_LACKS['precision']}")

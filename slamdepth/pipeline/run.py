@@ -154,6 +154,7 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
         seed=config.seed,
         weights=config.depth.weights,
         precision=config.depth.precision,
+        input_px=config.depth.input_px,
     )
     if is_sensor(given):
         if not dataset.has_depth:
