@@ -5,11 +5,13 @@
     python -m benchmarks.depth accuracy SEQ... --train PAIRS --held-out 'PAIRS[40-73]' 'PAIRS[350-383]'
     python -m benchmarks.depth left-out SEQ... --samples 40 --coarse-epochs 5 --unmixed
     python -m benchmarks.depth latency --models dinov2 --threads 1 2 --data SEQ --output latency.json
+    python -m benchmarks.depth latency --models dinov2:float32 dinov2:int8 dinov2:int8:32340 --one-pass
 
 accuracy: baselines trained here and any depth models by name, judged on the same frames; a table, and a few
 predictions as DATA.png. Times are of whole predictions with all cores.
 left-out: the head trained without each place and judged on it, and trained on all and judged on SEQ...
-latency: milliseconds before, in and after the ViT, for each device and number of threads.
+latency: milliseconds before, in and after the ViT, for each device and number of threads; how far depth
+is from that of the first model.
 
 The first two keep heads and figures in --output DIR and compute nothing twice. Run latency on an idle
 machine: its file records the load, and CPU time far below wall time shows that others took the processor.
@@ -158,13 +160,18 @@ def latency(asked: argparse.Namespace) -> None:
         frames = depth_latency.frames_of(asked.data, asked.repeats)
     else:
         frames = [depth_latency.noise_frame(asked.frame)]
+    if asked.one_pass:
+        frames = [depth_latency.upright(frame) for frame in frames]
+    reference = depth_latency.reference_depth(asked.models[0], asked.devices[0], frames)
     rows = []
     for device in asked.devices:
         for threads in asked.threads if device == "cpu" else asked.threads[-1:]:
             torch.set_num_threads(threads)
             for name in asked.models:
                 progress_line(f"{name} on {device}, {threads} threads")
-                rows.append(depth_latency.latency_row(name, device, frames, asked.repeats, asked.warm_up))
+                rows.append(
+                    depth_latency.latency_row(name, device, frames, asked.repeats, asked.warm_up, reference)
+                )
     print(depth_latency.table(rows))
     if asked.output:
         write_benchmark(asked.output, begun, _settings(asked), rows=rows)
@@ -250,11 +257,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         made.add_argument("--output", "-o", type=Path, default=Path("runs") / folder, metavar="DIR")
     three = command("latency", latency)
     three.add_argument("--models", nargs="+", default=["dinov2", "dinov2-mlp-224", "dinov2-mlp-32"],
-                       metavar="NAME", help="dinov2-mlp-224 and -32 have random weights")  # fmt: skip
+                       metavar="NAME", help="dinov2-mlp-224 and -32 have random weights; dinov2:int8:32340 "
+                       "names a precision and the pixels of the input")  # fmt: skip
     three.add_argument("--devices", nargs="+", default=["cpu"], metavar="DEVICE", help="cpu cuda")
     three.add_argument("--threads", type=positive, nargs="+", default=[1, 2], metavar="N")
     three.add_argument("--data", type=Path, metavar="SEQ", help="frames of a sequence in place of noise")
     three.add_argument("--frame", default="480x640", metavar="ROWSxCOLUMNS", help="size of the noise")
+    three.add_argument("--one-pass", action="store_true", help="gravity as of a camera held upright is given")
     three.add_argument("--repeats", type=positive, default=30, metavar="N")
     three.add_argument("--warm-up", type=_whole_number(0), default=5, metavar="N")
     three.add_argument("--output", "-o", type=Path, metavar="FILE", help="write the figures as JSON")

@@ -21,6 +21,8 @@ from benchmarks.depth_left_out import DEFAULT_CONFIG, config_without, left_out_r
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.dinov2_mlp import MlpHead
 from slamdepth.depth.registry import create_depth_model
+from slamdepth.depth.scale import DepthScale
+from slamdepth.depth.scaled import ScaledDepth
 from slamdepth.errors import ConfigError
 from slamdepth.training.config import SourceConfig, TrainConfig
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
@@ -296,3 +298,26 @@ def test_places_left_out_from_the_command_line(
         "| without-near", "| without-far", "| each without the place",
     ]  # fmt: skip
     assert len(json.loads((tmp_path / "out" / "left-out.json").read_text())["rows"]) == 3
+
+
+def test_depth_of_a_model_is_compared_with_that_of_the_first(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def model(name: str, device: str) -> DepthModel:
+        return tiny_model() if name == "tiny" else ScaledDepth(tiny_model(), DepthScale(1.1))
+
+    monkeypatch.setattr("benchmarks.depth_latency._model", model)
+    threads = torch.get_num_threads()
+    try:
+        main(["latency", "--models", "tiny", "larger", "--one-pass", "--threads", "1", "--repeats", "2"])
+    finally:
+        torch.set_num_threads(threads)
+    first, larger = capsys.readouterr().out.splitlines()[2:4]
+    assert first.split("|")[-2].strip() == "0.0000"
+    assert larger.split("|")[-2].strip() == "0.0953"
+
+
+@pytest.mark.parametrize("name", ["dinov2:int7", "dinov2:int8:many"])
+def test_a_precision_or_size_that_is_none_is_refused(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["latency", "--models", name, "--threads", "1"])
+    assert f"'{name.split(':')[-1]}' is no" in capsys.readouterr().out

@@ -163,3 +163,20 @@ def test_int8_changes_depth_by_a_per_cent() -> None:
     exact = create_depth_model("dinov2", precision="float32").predict(frame)
     int8 = create_depth_model("dinov2", precision="int8").predict(replace(frame, gravity=exact.gravity))
     assert np.median(np.abs(np.log(int8.values / exact.values))) < 0.03
+
+
+def test_a_smaller_input_keeps_the_scale_of_the_trained_one() -> None:
+    head = HeadEnsemble(HeadShape((0, 1), 48, 16, 1, 8, input_px=56 * 70)).eval().requires_grad_(False)
+    frame, far = frame_of(160, 128, 130.0), frame_of(160, 128, 260.0)
+    trained = Dinov2Depth(_backbone(), head, (), precision="float32")
+    smaller = Dinov2Depth(_backbone(), head, (), precision="float32", input_px=28 * 42)
+    # An untrained head predicts 1.8 m at the canonical focal length, whatever it sees.
+    np.testing.assert_allclose(smaller.predict(frame).values, trained.predict(frame).values, rtol=0.02)
+    np.testing.assert_allclose(smaller.predict(far).values, trained.predict(far).values, rtol=0.02)
+    assert smaller.predict(frame).values.shape == (128, 160)
+
+
+def test_other_models_have_no_choice_of_input_size() -> None:
+    for name in ("sensor", "onnx:x.onnx", "hf:ORG/NAME"):
+        with pytest.raises(ConfigError, match="has no choice of input size"):
+            create_depth_model(name, input_px=30_000)
