@@ -55,7 +55,7 @@ class DepthCache:
         camera = dataset.camera
         identity = "\n".join(
             [
-                *(f"{info.name} {info.sha256}" for info in model.weights),
+                *(f"{info.name} {info.sha256} {info.precision}" for info in model.weights),
                 _code_sha256(),
                 f"{camera}",
                 sequence_id(dataset),

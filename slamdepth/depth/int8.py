@@ -71,7 +71,7 @@ def _largest(weight: Tensor) -> Tensor:
 
 
 def check_int8(device: str) -> None:
-    """Check that :class:`Int8Linear` works here and is faster than float32.
+    """Check that :class:`Int8Linear` works here, where it is faster than float32.
 
     Raises:
         ConfigError: the device is no CPU, the processor lacks AVX2, or this PyTorch has no such kernels.
