@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slamdepth.backend import bundle_solver
+from slamdepth.backend import camera_system
 from slamdepth.backend.bundle import bundle_adjust
 from slamdepth.backend.bundle_problem import BundleProblem
-from slamdepth.backend.bundle_solver import HUBER, State
+from slamdepth.backend.bundle_solver import Solver
+from slamdepth.backend.sightings import HUBER, Sightings, State
 from slamdepth.geometry import invert, project, rotation_angle_rad, se3_exp, transform
 from slamdepth.types import Camera
 
@@ -93,7 +94,7 @@ def test_a_doubted_prior_does_not_bend_the_cameras() -> None:
 
 def test_points_are_placed_without_moving_cameras() -> None:
     problem = terrace(6.0)
-    solver = bundle_solver.Solver(problem, np.ones(len(problem.px), dtype=np.bool_))
+    solver = Solver(problem, Sightings(problem))
     state = State(problem.T_camera_world, problem.points_w, np.zeros(len(problem.fixed)), 0.0)
     placed = solver.place_points(state)
     np.testing.assert_array_equal(placed.T, problem.T_camera_world)
@@ -284,7 +285,7 @@ def test_a_wild_depth_is_outvoted() -> None:
 def test_sparse_and_dense_eliminations_agree(monkeypatch: pytest.MonkeyPatch, sigma_scale: float) -> None:
     problem = noisy(perturbed(replace(truth(), sigma_scale=sigma_scale)), 0.5)
     dense = bundle_adjust(problem)
-    monkeypatch.setattr(bundle_solver, "_DENSE_LIMIT", 0)
+    monkeypatch.setattr(camera_system, "_DENSE_PRODUCT", 0)
     sparse = bundle_adjust(problem)
     np.testing.assert_allclose(sparse.T_camera_world, dense.T_camera_world, atol=1e-9)
     np.testing.assert_allclose(sparse.points_w, dense.points_w, atol=1e-8)

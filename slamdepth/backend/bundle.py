@@ -24,8 +24,9 @@ from __future__ import annotations
 import numpy as np
 
 from slamdepth.backend.bundle_problem import BundleProblem, BundleResult
-from slamdepth.backend.bundle_solver import MIN_DEPTH_M, Solver, State
-from slamdepth.geometry import CHI2_2DOF_95, reprojection_errors
+from slamdepth.backend.bundle_solver import Solver
+from slamdepth.backend.sightings import Sightings, State
+from slamdepth.geometry import CHI2_2DOF_95
 from slamdepth.typing import Floats
 
 
@@ -41,22 +42,20 @@ def bundle_adjust(
     state = State(
         problem.T_camera_world.copy(), problem.points_w.copy(), np.zeros(len(problem.T_camera_world))
     )
-    keep = np.ones(len(problem.obs_camera), dtype=bool)
+    every = Sightings(problem)
     first_cost: float | None = None
     cost = 0.0
     steps = 0
-    solver = Solver(problem, keep)
+    solver = Solver(problem, every)
     if problem.doubt > 1.0:
         state = solver.place_points(state)
     for phase, limit in enumerate(iterations):
         if phase:
-            chi2 = _pixel_chi2(problem, state)
-            keep = chi2 < gate
-            solver = Solver(problem, keep)
+            solver = Solver(problem, every.where(_pixel_chi2(every, state) < gate))
         state, start, cost, taken = solver.run(state, limit)
         first_cost = start if first_cost is None else first_cost
         steps += taken
-    chi2 = _pixel_chi2(problem, state)
+    chi2 = _pixel_chi2(every, state)
     return BundleResult(
         T_camera_world=state.T,
         points_w=state.X,
@@ -72,12 +71,8 @@ def bundle_adjust(
     )
 
 
-def _pixel_chi2(problem: BundleProblem, state: State) -> Floats:
-    T = state.T[problem.obs_camera]
-    P = (np.einsum("nij,nj->ni", T[:, :3, :3], state.X[problem.obs_point]) + T[:, :3, 3]).T
-    du, dv = reprojection_errors(problem.camera, P, problem.px.T, MIN_DEPTH_M)
-    if problem.px_rate is not None:
-        du = du - state.readout_s * problem.px_rate[:, 0]
-        dv = dv - state.readout_s * problem.px_rate[:, 1]
-    chi2 = (du * du + dv * dv) / problem.sigma_px**2
-    return np.where(P[2] > MIN_DEPTH_M, chi2, np.inf)
+def _pixel_chi2(every: Sightings, state: State) -> Floats:
+    """Squared whitened pixel residuals ``(M,)`` of all observations, in the order of the problem."""
+    chi2 = np.empty(len(every))
+    chi2[every.index] = every.pixel_chi2(state)
+    return chi2

@@ -7,6 +7,9 @@ import numpy as np
 
 from slamdepth.typing import Floats
 
+SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""The elements that are kept of a symmetric block, in their order."""
+
 
 def inverse_factor(H: Floats, damping: float) -> Floats:
     """``(6, P)`` M, lower triangular by rows, with ``M^T M`` the inverse of the damped ``H``."""
@@ -34,7 +37,22 @@ def transposed_times(M: Floats, v: Floats) -> Floats:
 def times_transposed(B: Floats, M: Floats) -> Floats:
     """``B M^T`` for ``(C, 3, N)`` and ``(6, N)``."""
     out = np.empty_like(B)
-    out[:, 0] = B[:, 0] * M[0]
-    out[:, 1] = B[:, 0] * M[1] + B[:, 1] * M[2]
-    out[:, 2] = B[:, 0] * M[3] + B[:, 1] * M[4] + B[:, 2] * M[5]
+    np.multiply(B[:, 0], M[0], out=out[:, 0])
+    np.multiply(B[:, 0], M[1], out=out[:, 1])
+    out[:, 1] += B[:, 1] * M[2]
+    np.multiply(B[:, 0], M[3], out=out[:, 2])
+    out[:, 2] += B[:, 1] * M[4]
+    out[:, 2] += B[:, 2] * M[5]
     return out
+
+
+def inverse(H: Floats) -> Floats:
+    """Inverses ``(P, 3, 3)`` of positive definite blocks ``(6, P)``."""
+    h00, h01, h02, h11, h12, h22 = H
+    c00, c01, c02 = h11 * h22 - h12 * h12, h02 * h12 - h01 * h22, h01 * h12 - h02 * h11
+    inv_det = 1.0 / (h00 * c00 + h01 * c01 + h02 * c02)
+    c11, c12, c22 = h00 * h22 - h02 * h02, h01 * h02 - h00 * h12, h00 * h11 - h01 * h01
+    full = np.empty((H.shape[1], 3, 3))
+    for cofactor, (i, j) in zip((c00, c01, c02, c11, c12, c22), SYMMETRIC, strict=True):
+        full[:, i, j] = full[:, j, i] = cofactor * inv_det
+    return full
