@@ -282,14 +282,19 @@ def test_a_wild_depth_is_outvoted() -> None:
 
 
 @pytest.mark.parametrize("sigma_scale", [0.0, 0.2])
-def test_sparse_and_dense_eliminations_agree(monkeypatch: pytest.MonkeyPatch, sigma_scale: float) -> None:
+def test_cameras_may_be_taken_by_groups_and_solved_by_iteration(
+    monkeypatch: pytest.MonkeyPatch, sigma_scale: float
+) -> None:
     problem = noisy(perturbed(replace(truth(), sigma_scale=sigma_scale)), 0.5)
+    monkeypatch.setattr(camera_system, "_GROUP", 100)
     dense = bundle_adjust(problem)
-    monkeypatch.setattr(camera_system, "_DENSE_PRODUCT", 0)
-    sparse = bundle_adjust(problem)
-    np.testing.assert_allclose(sparse.T_camera_world, dense.T_camera_world, atol=1e-9)
-    np.testing.assert_allclose(sparse.points_w, dense.points_w, atol=1e-8)
-    assert sparse.iterations == dense.iterations
+    monkeypatch.setattr(camera_system, "_GROUP", 14)
+    for most, atol in ((400, 1e-9), (0, 1e-6)):
+        monkeypatch.setattr(camera_system, "_DENSE_CAMERAS", most)
+        monkeypatch.setattr(camera_system, "_CLUSTER", 2)
+        other = bundle_adjust(problem)
+        np.testing.assert_allclose(other.T_camera_world, dense.T_camera_world, atol=atol)
+        np.testing.assert_allclose(other.points_w, dense.points_w, atol=10 * atol)
 
 
 def test_the_order_of_observations_does_not_matter() -> None:

@@ -1,31 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
 """The equations of the cameras that are left when the points are eliminated, and their solution.
 
-With ``Hpp = C C^T`` and ``Z = Hcp C^-T`` they are ``Hcc - Z Z^T``, one symmetric product. Of a few hundred
-cameras it is kept dense and factorised. Of more it is kept sparse and solved by conjugate gradients, so that
-memory and time grow with what cameras share; the preconditioner solves clusters of consecutive cameras (Kushal
-and Agarwal, "Visibility Based Preconditioning for Bundle Adjustment", CVPR 2012).
+They are ``Hcc - Z Z^T``. The product is taken by groups of consecutive cameras: two groups share few enough of
+their points to leave the rest out, and enough for a product of matrices. Of a few hundred cameras the result
+is kept dense and factorised. Of more it is kept sparse and solved by conjugate gradients, so that memory and
+time grow with what cameras share; the preconditioner solves clusters of consecutive cameras (Kushal and
+Agarwal, "Visibility Based Preconditioning for Bundle Adjustment", CVPR 2012).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from slamdepth.backend.normal_equations import CAM
 from slamdepth.backend.sightings import Sightings
-from slamdepth.typing import Bools, Floats
+from slamdepth.typing import Bools, Floats, Ints
 
 Solve = Callable[[Floats], Floats]
 
-_DENSE_PRODUCT = 4_000_000  # numbers in Z before it is kept sparse
-_DENSE_CAMERAS = 400  # before what is left is kept sparse
+_GROUP = 24  # unknowns
+_DENSE_CAMERAS = 400
 _CLUSTER = 40  # consecutive cameras
 _SOLVED = 1e-6  # of the right side
 _MAX_ITERATIONS = 500
 _SCALE = CAM - 1
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Unknowns of consecutive cameras.
+
+    Attributes:
+        unknowns: where they lie among all.
+        points: ``(Q,)`` that the cameras see.
+        parts: of each camera its slot, the place of its unknowns in the group, its observations, and the rows of
+            their points in ``points``.
+    """
+
+    unknowns: slice
+    points: Ints
+    parts: list[tuple[int, slice, slice, Ints]]
 
 
 class CameraSystem:
@@ -50,6 +69,8 @@ class CameraSystem:
         self._pinned = free + np.flatnonzero(scaled[free:])
         self._of_moving = self._each * free
         self.size = self._of_moving + len(self._pinned)
+        self._groups = self._grouped()
+        self._shared = self._shared_points()
 
     def packed(self, of_slot: Floats) -> Floats:
         """The unknowns ``(size,)`` among values ``(K, 7)``."""
@@ -64,87 +85,135 @@ class CameraSystem:
         out[self._pinned, _SCALE] = x[self._of_moving :]
         return out
 
-    def solver(self, Hcc: Floats, Z: Floats, z_pinned: Floats) -> Solve:
+    def _grouped(self) -> list[_Group]:
+        sightings, each = self._sightings, self._each
+        slots = [*range(sightings.free), *self._pinned.tolist()]
+        widths = [each] * sightings.free + [1] * len(self._pinned)
+        groups: list[_Group] = []
+        first = at = 0
+        while first < len(slots):
+            last = first + 1
+            width = widths[first]
+            while last < len(slots) and width + widths[last] <= _GROUP:
+                width += widths[last]
+                last += 1
+            blocks = [sightings.block(slot) for slot in slots[first:last]]
+            points, rows = np.unique(
+                np.concatenate([sightings.pt[block] for block in blocks]), return_inverse=True
+            )
+            ends = np.cumsum([block.stop - block.start for block in blocks])[:-1]
+            places = np.concatenate([[0], np.cumsum(widths[first:last])]).tolist()
+            parts = [
+                (slot, slice(a, b), block, own)
+                for slot, (a, b), block, own in zip(
+                    slots[first:last], pairwise(places), blocks, np.split(rows, ends), strict=True
+                )
+            ]
+            groups.append(_Group(slice(at, at + width), points, parts))
+            first, at = last, at + width
+        return groups
+
+    def _shared_points(self) -> list[tuple[int, int, Ints, Ints]]:
+        """Of each two groups that share points, their numbers and the rows of those points."""
+        from scipy.sparse import csr_matrix
+
+        groups = self._groups
+        if len(groups) < 2:
+            return []
+        ends = np.concatenate([[0], np.cumsum([len(group.points) for group in groups])])
+        points = np.concatenate([group.points for group in groups])
+        sees = csr_matrix((np.ones(len(points), np.int32), points, ends), shape=(len(groups), self._points))
+        together = (sees @ sees.T).tocsr()
+        together.sort_indices()
+        row = np.full(self._points, -1)
+        shared = []
+        for a, group in enumerate(groups):
+            row[group.points] = np.arange(len(group.points))
+            for b in together.indices[together.indptr[a] : together.indptr[a + 1]].tolist():
+                if b > a:
+                    of_a = row[groups[b].points]
+                    of_b = np.flatnonzero(of_a >= 0)
+                    shared.append((a, b, of_a[of_b], of_b))
+            row[group.points] = -1
+        return shared
+
+    def solver(self, Hcc: Floats, Z: Floats, z_fixed: Floats) -> Solve:
         """Solves ``(Hcc - Z Z^T) x = b`` for ``b (size,)``.
 
         Args:
             Hcc: ``(K, 7, 7)``.
             Z: ``(7, 3, N)`` of the observations of cameras that may move.
-            z_pinned: ``(3, M)`` its row of the depth scale, of the observations of fixed cameras.
+            z_fixed: ``(3, M)`` its row of the depth scale, of the observations of fixed cameras.
         """
         if self.size == 0:
             return lambda b: b
-        if self.size * self._points * 3 <= _DENSE_PRODUCT:
-            S = self._dense_product(Z, z_pinned)
-        else:
-            product = self._sparse_product(Z, z_pinned)
-            if self._sightings.free > _DENSE_CAMERAS:
-                return self._iterative(Hcc, product)
-            S = product.toarray()
-        np.negative(S, out=S)
-        moving = S[: self._of_moving, : self._of_moving]
-        free, each = self._sightings.free, np.arange(self._sightings.free)
-        blocks = moving.reshape(free, self._each, free, self._each)
-        blocks[each, :, each] += Hcc[:free, : self._each, : self._each]
-        pinned = np.arange(self._of_moving, self.size)
-        S[pinned, pinned] += Hcc[self._pinned, _SCALE, _SCALE]
+        blocks = self._blocks(Hcc, Z, z_fixed)
+        if self._sightings.free > _DENSE_CAMERAS:
+            return self._iterative(blocks)
+        S = np.zeros((self.size, self.size))
+        for (a, b), block in blocks.items():  # one triangle is enough
+            S[self._groups[a].unknowns, self._groups[b].unknowns] = block
         return _factorised(S)
 
-    def _dense_product(self, Z: Floats, z_pinned: Floats) -> Floats:
-        sightings, each = self._sightings, self._each
-        dense = np.zeros((self.size, 3, self._points))
-        for slot in range(sightings.free):
-            block = sightings.block(slot)
-            dense[each * slot : each * (slot + 1)][:, :, sightings.pt[block]] = Z[:each, :, block]
-        first = sightings.moving
-        for row, slot in enumerate(self._pinned.tolist(), start=self._of_moving):
-            block = sightings.block(slot)
-            dense[row][:, sightings.pt[block]] = z_pinned[:, block.start - first : block.stop - first]
-        flat = dense.reshape(self.size, 3 * self._points)
-        return np.asarray(flat @ flat.T)
+    def _blocks(self, Hcc: Floats, Z: Floats, z_fixed: Floats) -> dict[tuple[int, int], Floats]:
+        """``Hcc - Z Z^T`` by groups, of each two once."""
+        free, each, moving = self._sightings.free, self._each, self._sightings.moving
+        by_row = np.ascontiguousarray(Z[:each].T)  # a row at a time is faster to gather than a number
+        wide = []
+        found: dict[tuple[int, int], Floats] = {}
+        for a, group in enumerate(self._groups):
+            width = group.unknowns.stop - group.unknowns.start
+            own = np.zeros((len(group.points), 3, width))
+            block = np.zeros((width, width))
+            for slot, place, seen, rows in group.parts:
+                if slot < free:
+                    own[rows, :, place] = by_row[seen]
+                    block[place, place] = Hcc[slot, :each, :each]
+                else:
+                    own[rows, :, place] = z_fixed[:, seen.start - moving : seen.stop - moving].T[..., None]
+                    block[place, place] = Hcc[slot, _SCALE, _SCALE]
+            flat = own.reshape(-1, width)
+            block -= flat.T @ flat
+            found[a, a] = block
+            wide.append(own)
+        for a, b, of_a, of_b in self._shared:
+            mine, theirs = wide[a].take(of_a, axis=0), wide[b].take(of_b, axis=0)
+            found[a, b] = -(mine.reshape(-1, mine.shape[2]).T @ theirs.reshape(-1, theirs.shape[2]))
+        return found
 
-    def _sparse_product(self, Z: Floats, z_pinned: Floats) -> Any:
-        from scipy.sparse import bsr_matrix, csr_matrix
-
-        sightings, each, columns = self._sightings, self._each, 3 * self._points
-        free, first = sightings.free, sightings.moving
-        moving = bsr_matrix(
-            (np.ascontiguousarray(Z[:each].transpose(2, 0, 1)), sightings.pt[:first], sightings.ends[: free + 1]),
-            shape=(self._of_moving, columns),
-        )
-        product = moving @ moving.T
-        if not len(self._pinned):
-            return product
-        from scipy.sparse import bmat
-
-        fixed = csr_matrix(
-            (
-                z_pinned.T.ravel(),
-                (3 * sightings.pt[first:, None] + np.arange(3)).ravel(),
-                3 * (sightings.ends[free:] - first),
-            ),
-            shape=(len(sightings.counts) - free, columns),
-        )[self._pinned - free]
-        across = moving @ fixed.T
-        return bmat([[product, across], [across.T, fixed @ fixed.T]], format="csr")
-
-    def _iterative(self, Hcc: Floats, product: Any) -> Solve:
-        """By conjugate gradients, from the sparse ``Z Z^T``."""
-        from scipy.sparse import block_diag, bsr_matrix
-
-        free, each = self._sightings.free, self._each
-        places = np.arange(free + 1)
-        diagonal = bsr_matrix((Hcc[:free, :each, :each], places[:-1], places))
-        if len(self._pinned):
-            diagonal = block_diag([diagonal, np.diag(Hcc[self._pinned, _SCALE, _SCALE])])
-        S = (diagonal.tocsr() - product.tocsr()).tocsr()
-        bounds = [*range(0, self._of_moving, each * _CLUSTER), self.size]
-        clusters = [(a, b, _factorised(S[a:b, a:b].toarray())) for a, b in zip(bounds, bounds[1:])]
+    def _iterative(self, blocks: dict[tuple[int, int], Floats]) -> Solve:
+        """By conjugate gradients."""
+        S = self._sparse(blocks)
+        step = max(_CLUSTER // (_GROUP // self._each), 1)
+        starts = [group.unknowns.start for group in self._groups[::step]]
+        clusters = [(a, b, _factorised(S[a:b, a:b].toarray())) for a, b in pairwise([*starts, self.size])]
 
         def precondition(r: Floats) -> Floats:
             return np.concatenate([solve(r[a:b]) for a, b, solve in clusters])
 
-        return lambda b: conjugate_gradients(lambda x: S @ x, b, precondition)
+        return lambda b: conjugate_gradients(S.__matmul__, b, precondition)
+
+    def _sparse(self, blocks: dict[tuple[int, int], Floats]) -> Any:
+        """All blocks as one sparse matrix, both triangles."""
+        from scipy.sparse import csr_matrix
+
+        rows: list[list[tuple[int, Floats]]] = [[] for _ in self._groups]
+        for (a, b), block in sorted(blocks.items()):
+            rows[a].append((b, block))
+            if a != b:
+                rows[b].append((a, block.T))
+        data, indices, counts = [], [], []
+        for row in rows:
+            row.sort(key=lambda entry: entry[0])
+            whole = np.hstack([block for _, block in row])
+            places = np.concatenate(
+                [np.arange(self._groups[b].unknowns.start, self._groups[b].unknowns.stop) for b, _ in row]
+            )
+            data.append(whole.ravel())
+            indices.append(np.tile(places.astype(np.int32), len(whole)))
+            counts.append(np.full(len(whole), len(places)))
+        ends = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+        return csr_matrix((np.concatenate(data), np.concatenate(indices), ends), shape=(self.size, self.size))
 
 
 def conjugate_gradients(times: Solve, b: Floats, precondition: Solve) -> Floats:
@@ -168,12 +237,11 @@ def conjugate_gradients(times: Solve, b: Floats, precondition: Solve) -> Floats:
 
 
 def _factorised(S: Floats) -> Solve:
-    """Solves ``S x = b`` for a symmetric ``S``, which may be overwritten."""
+    """Solves ``S x = b`` for a symmetric ``S``, of which the upper triangle is read."""
     from scipy.linalg.lapack import dpotrf, dpotrs
 
-    factor, info = dpotrf(S.T, lower=1, overwrite_a=1, clean=0)
+    factor, info = dpotrf(S.T, lower=1, clean=0)  # columns of S.T are rows of S: no copy is turned
     if info == 0:
         return lambda b: np.asarray(dpotrs(factor, b, lower=1)[0], dtype=np.float64)
-    upper = np.triu(S, 1)
-    whole = upper + upper.T + np.diag(np.diag(S))
+    whole = np.triu(S) + np.triu(S, 1).T
     return lambda b: np.asarray(np.linalg.lstsq(whole, b, rcond=None)[0], dtype=np.float64)
