@@ -6,8 +6,8 @@ few points whose depth a network has guessed; it may be turned by ten degrees to
 of steps turns it back. So the cameras that share many points, which geometry alone determines, are kept, and
 the others are added one by one as incremental structure from motion adds them (Schönberger and Frahm,
 "Structure-from-Motion Revisited", CVPR 2016): resection from the points that registered cameras triangulate,
-without predicted depth, a small adjustment, the next camera. The whole adjustment then decides which start
-is better.
+without predicted depth, a small adjustment, the next camera. As long as resection finds the cameras where they
+are, they stay there and nothing is adjusted. The whole adjustment then decides which start is better.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ import numpy as np
 
 from slamdepth.backend.bundle import bundle_adjust
 from slamdepth.backend.bundle_problem import BundleProblem
+from slamdepth.backend.point_blocks import SYMMETRIC, inverse
 from slamdepth.geometry import backproject, invert, orthonormalised, rotation_angle_rad, transform
-from slamdepth.typing import Bools, Ints
+from slamdepth.typing import Bools, Floats, Ints
 
 _LINKED = 0.4  # of the most points that two cameras share: so many and they belong together
 _LEAST = 12  # triangulated points that a camera is placed by
@@ -32,6 +33,7 @@ _HELD = 8  # ... and placed cameras that hold them
 _STEPS = (3, 3)
 _TURNED_RAD = np.deg2rad(3.0)  # less is the same start
 _MOVED = 0.06  # of the distance to what is seen
+_IN_PLACE = 0.5  # of both: resection errs by as much
 
 
 def multi_start(problem: BundleProblem) -> BundleProblem | None:
@@ -58,15 +60,16 @@ class _Growth:
     def __init__(self, problem: BundleProblem) -> None:
         self._problem = problem
         self._count = len(problem.T_camera_world)
-        order = np.argsort(problem.obs_camera, kind="stable")
-        bounds = np.searchsorted(problem.obs_camera[order], np.arange(self._count + 1))
-        self._seen_by = [order[bounds[k] : bounds[k + 1]] for k in range(self._count)]
+        self._seen_by = _ByIndex(problem.obs_camera, self._count)
+        self._seeing = _ByIndex(problem.obs_point, len(problem.points_w))
         self._together = self._shared()
         self.T = problem.T_camera_world.copy()
         self.X = problem.points_w.copy()
         self._placed = self._best_held_piece()
         self._is_known = np.zeros(len(self.X), dtype=bool)
+        self._known = np.zeros(self._count, dtype=np.int64)  # points that each camera sees and that are known
         self._grown: list[int] = []
+        self._has_moved = False
         self._rays = backproject(problem.camera, problem.px, np.ones(len(problem.px)))
         self._rays /= np.linalg.norm(self._rays, axis=1, keepdims=True)
         self.is_possible = 3 <= np.count_nonzero(self._placed) < self._count
@@ -95,10 +98,7 @@ class _Growth:
         self._triangulate(np.arange(len(self.X)))
         failed = np.zeros(self._count, dtype=bool)
         while True:
-            known = np.bincount(
-                self._problem.obs_camera[self._is_known[self._problem.obs_point]], minlength=self._count
-            )
-            known[self._placed | failed] = 0
+            known = np.where(self._placed | failed, 0, self._known)
             k = int(np.argmax(known))
             if known[k] < _LEAST:
                 break
@@ -108,12 +108,16 @@ class _Growth:
             failed[:] = False  # what it sees may place others
             self._placed[k] = True
             self._grown.append(k)
-            self._triangulate(self._problem.obs_point[self._seen_by[k]])
-            self._adjust()
+            self._has_moved |= self._is_elsewhere(k, _IN_PLACE)
+            if not self._has_moved:
+                self.T[k] = self._problem.T_camera_world[k]
+            self._triangulate(self._problem.obs_point[self._seen_by.of(k)])
+            if self._has_moved:
+                self._adjust()
 
     def _resect(self, k: int) -> bool:
         p = self._problem
-        seen = self._seen_by[k]
+        seen = self._seen_by.of(k)
         seen = seen[self._is_known[p.obs_point[seen]]]
         points, px = self.X[p.obs_point[seen]], np.ascontiguousarray(p.px[seen])
         gate_px = _GATE_PX * float(np.median(p.sigma_px[seen]))
@@ -130,22 +134,29 @@ class _Growth:
         return True
 
     def _triangulate(self, points: Ints) -> None:
-        """Points nearest to the rays of the placed cameras that see them."""
+        """Each of ``points (N,)`` nearest to the rays of the placed cameras that see it."""
         p = self._problem
-        wanted = np.zeros(len(self.X), dtype=bool)
-        wanted[points] = True
-        at = np.flatnonzero(wanted[p.obs_point] & self._placed[p.obs_camera])
+        at, row = self._seeing.of_each(points)
+        is_placed = self._placed[p.obs_camera[at]]
+        at, row = at[is_placed], row[is_placed]
         T_world_camera = invert(self.T)[p.obs_camera[at]]
-        d = np.einsum("nij,nj->ni", T_world_camera[:, :3, :3], self._rays[at])
-        Q = np.eye(3) - d[:, :, None] * d[:, None, :]
-        A, b = np.zeros((len(self.X), 3, 3)), np.zeros((len(self.X), 3))
-        np.add.at(A, p.obs_point[at], Q)
-        np.add.at(b, p.obs_point[at], np.einsum("nij,nj->ni", Q, T_world_camera[:, :3, 3]))
-        rows = np.flatnonzero(wanted)
-        wide = np.linalg.eigvalsh(A[rows])[:, 0] >= _PARALLAX
-        self._is_known[rows] = wide
-        good = rows[wide]
-        self.X[good] = np.linalg.solve(A[good], b[good][..., None])[..., 0]
+        d = np.einsum("nij,nj->in", T_world_camera[:, :3, :3], self._rays[at])
+        center = T_world_camera[:, :3, 3].T
+        off = center - d * (d * center).sum(axis=0)
+
+        def by_point(values: Floats) -> Floats:
+            return np.bincount(row, values, minlength=len(points))
+
+        A = np.stack([by_point((i == j) - d[i] * d[j]) for i, j in SYMMETRIC])
+        b = np.stack([by_point(axis) for axis in off])
+        is_wide = _exceeds(A, _PARALLAX)
+        good = points[is_wide]
+        self.X[good] = np.einsum("nij,jn->ni", inverse(A[:, is_wide]), b[:, is_wide])
+        changed = points[self._is_known[points] != is_wide]
+        self._is_known[points] = is_wide
+        at, row = self._seeing.of_each(changed)
+        sign = np.where(self._is_known[changed], 1, -1)[row]
+        np.add.at(self._known, p.obs_camera[at], sign)
 
     def _adjust(self) -> None:
         """The cameras placed last, held by those that share most points with them; no predicted depth."""
@@ -184,13 +195,16 @@ class _Growth:
 
     def is_other(self) -> bool:
         """Whether a camera was placed elsewhere than where the problem has it."""
+        return self._has_moved and any(self._is_elsewhere(k, 1.0) for k in self._grown)
+
+    def _is_elsewhere(self, k: int, share: float) -> bool:
+        """Whether a camera is turned or moved by more than a ``share`` of what makes another start."""
         p = self._problem
-        for k in self._grown:
-            D = self.T[k] @ invert(p.T_camera_world[k])
-            z = float(np.median(transform(self.T[k], self.X[p.obs_point[self._seen_by[k]]])[:, 2]))
-            if rotation_angle_rad(D[:3, :3]) > _TURNED_RAD or np.linalg.norm(D[:3, 3]) > _MOVED * z:
-                return True
-        return False
+        D = self.T[k] @ invert(p.T_camera_world[k])
+        points = self.X[p.obs_point[self._seen_by.of(k)]]
+        z = float(np.median(points @ self.T[k, 2, :3] + self.T[k, 2, 3]))
+        is_turned = float(rotation_angle_rad(D[:3, :3])) > share * _TURNED_RAD
+        return is_turned or float(np.linalg.norm(D[:3, 3])) > share * _MOVED * z
 
     def start(self) -> BundleProblem:
         """The problem from where the cameras were placed.
@@ -214,3 +228,31 @@ class _Growth:
         T = orthonormalised(T @ invert(T_old_new))
         T[held] = p.T_camera_world[held]
         return replace(p, T_camera_world=T, points_w=transform(T_old_new, X))
+
+
+class _ByIndex:
+    """Which observations belong to each camera, or to each point."""
+
+    def __init__(self, index: Ints, count: int) -> None:
+        self._order = np.argsort(index, kind="stable")
+        self._ends = np.concatenate([[0], np.cumsum(np.bincount(index, minlength=count))])
+
+    def of(self, k: int) -> Ints:
+        """Those of one, ascending."""
+        return self._order[self._ends[k] : self._ends[k + 1]]
+
+    def of_each(self, wanted: Ints) -> tuple[Ints, Ints]:
+        """Those of each of ``wanted (N,)``, and the place in ``wanted`` that each belongs to."""
+        counts = self._ends[wanted + 1] - self._ends[wanted]
+        row = np.repeat(np.arange(len(wanted)), counts)
+        first = self._ends[wanted] - (np.cumsum(counts) - counts)
+        return self._order[np.arange(len(row)) + first[row]], row
+
+
+def _exceeds(A: Floats, least: float) -> Bools:
+    """Whether all eigenvalues of symmetric 3 x 3 blocks ``(6, N)`` exceed a number (Sylvester's criterion)."""
+    a00, a01, a02, a11, a12, a22 = A
+    a00, a11, a22 = a00 - least, a11 - least, a22 - least
+    minor = a00 * a11 - a01 * a01
+    det = a22 * minor - a00 * a12 * a12 - a11 * a02 * a02 + 2.0 * a01 * a02 * a12
+    return np.asarray((a00 > 0.0) & (minor > 0.0) & (det > 0.0))
