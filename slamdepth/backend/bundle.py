@@ -29,6 +29,9 @@ from slamdepth.backend.sightings import Sightings, State
 from slamdepth.geometry import CHI2_2DOF_95
 from slamdepth.typing import Floats
 
+_CONVERGED = 1e-3  # relative fall of the cost; what is left moves cameras by a fraction of their deviation
+_ROUGHLY_CONVERGED = 1e-2  # enough to tell outliers
+
 
 def bundle_adjust(
     problem: BundleProblem, iterations: tuple[int, ...] = (4, 6), gate: float = CHI2_2DOF_95
@@ -52,7 +55,8 @@ def bundle_adjust(
     for phase, limit in enumerate(iterations):
         if phase:
             solver = Solver(problem, every.where(_pixel_chi2(every, state) < gate))
-        state, start, cost, taken = solver.run(state, limit)
+        is_last = phase == len(iterations) - 1
+        state, start, cost, taken = solver.run(state, limit, _CONVERGED if is_last else _ROUGHLY_CONVERGED)
         first_cost = start if first_cost is None else first_cost
         steps += taken
     chi2 = _pixel_chi2(every, state)

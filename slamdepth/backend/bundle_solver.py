@@ -20,7 +20,6 @@ SCALE_CAUCHY = 2.0
 _POINT_STEPS = 4
 _WORTH = 0.98  # of the cost: steps of points that gain less are not worth their time
 _FARTHEST = 10.0  # times its distance: so far a point moves in one step
-_GAIN = 1e-4  # relative fall of the cost below which another step is not worth its time
 
 
 class Solver:
@@ -66,8 +65,12 @@ class Solver:
             seen = self._sightings.look(state)
         return state
 
-    def run(self, state: State, limit: int) -> tuple[State, float, float, int]:
-        """At most ``limit`` steps; returns the state, the cost before and after, the steps taken."""
+    def run(self, state: State, limit: int, least_gain: float) -> tuple[State, float, float, int]:
+        """At most ``limit`` steps; returns the state, the cost before and after, the steps taken.
+
+        Args:
+            least_gain: relative fall of the cost below which another step is not worth its time.
+        """
         seen = self._sightings.look(state)
         cost = start = self._cost(seen, state)
         damping = 1e-4
@@ -89,7 +92,7 @@ class Solver:
             gain = (cost - new_cost) / max(cost, 1e-12)
             state, seen, cost = candidate, new_seen, new_cost
             damping = max(damping * 0.2, 1e-8)
-            if gain < _GAIN:
+            if gain < least_gain:
                 break
         return state, start, cost, taken
 

@@ -100,8 +100,11 @@ class LoopCloser:
         self.places.add_vector(keyframe.id, words)
         if not self._config.loops.enabled:
             return None
+        looking_alike = self._looking_alike(keyframe)
+        if not looking_alike:
+            return None
         drift = self.drift()
-        alike, allowed = self.candidates(keyframe, drift)
+        alike, allowed = self._chosen(keyframe, looking_alike, drift)
         for candidate in dict.fromkeys([*alike, *allowed]):
             verified = self.verify(keyframe, candidate)
             if verified is None:
@@ -168,14 +171,21 @@ class LoopCloser:
         Returns:
             Of all, and of those that may see the same surfaces as far as odometry can have drifted.
         """
+        return self._chosen(keyframe, self._looking_alike(keyframe), drift)
+
+    def _looking_alike(self, keyframe: MapKeyframe) -> list[int]:
+        """All earlier keyframes that look like ``keyframe`` and share no landmarks with it, best first."""
         newest = keyframe.id - self._config.loops.min_gap
         if newest < 0:
-            return [], []
+            return []
         shared = self._map.shared_landmarks(keyframe.landmark_ids)
         exclude = {k for k in range(len(shared)) if k > newest or shared[k] >= ALREADY_LINKED}
         least = _MIN_SCORE_SHARE * self.places.score(keyframe.id, keyframe.id - 1)
         answers = self.places.query_keyframe(keyframe.id, exclude=exclude, top_k=newest + 1)
-        alike = [k for k, score in answers if score >= least]
+        return [k for k, score in answers if score >= least]
+
+    def _chosen(self, keyframe: MapKeyframe, alike: list[int], drift: Drift) -> tuple[list[int], list[int]]:
+        """The best of those that look alike, and of those among them that odometry allows."""
         nearby = set(drift.nearby(keyframe.id, self._distance_m(keyframe)).tolist())
         return alike[:_CANDIDATES], [k for k in alike if k in nearby][:_CANDIDATES]
 

@@ -74,6 +74,7 @@ class Map(MapView):
             velocity=np.zeros(6) if velocity is None else velocity.copy(),
         )
         self._states.append(state)
+        self._sights.note(state.id, landmark_ids)
         self._own.observations[landmark_ids[landmark_ids >= 0]] += 1
         keyframe = MapKeyframe(state)
         self.keyframes = (*self.keyframes, keyframe)
@@ -136,6 +137,7 @@ class Map(MapView):
         own.alive[ids] = True
         own.alias[ids] = ids
         self._states[keyframe.id].landmark_ids[features] = ids
+        self._sights.note(keyframe.id, ids)
         self._refresh_views(ids)
         return ids
 
@@ -155,6 +157,7 @@ class Map(MapView):
         there = seen[features]
         free = there < 0
         seen[features[free]] = ids[free]
+        self._sights.note(keyframe.id, ids[free])
         own.observations[ids[free]] += 1
         mine, theirs = ids[~free], there[~free]
         alive = (mine != theirs) & own.alive[mine] & own.alive[theirs]
@@ -175,6 +178,7 @@ class Map(MapView):
         free = np.flatnonzero((ids >= 0) & (seen < 0))
         free = free[own.alive[ids[free]] & ~present[ids[free]]]
         seen[free] = ids[free]
+        self._sights.note(keyframe.id, ids[free])
         own.observations[ids[free]] += 1
         both = np.flatnonzero((ids >= 0) & (seen >= 0) & (ids != seen))
         both = both[own.alive[ids[both]] & own.alive[seen[both]] & ~present[ids[both]]]
@@ -192,8 +196,8 @@ class Map(MapView):
         target[losers] = winners
         is_loser = self.mask(losers)
         own = self._own
-        for state in self._states:
-            ids = state.landmark_ids
+        for k in self._sights.candidates(is_loser):
+            ids = self._states[k].landmark_ids
             moved = np.flatnonzero(is_loser[ids])
             if len(moved) == 0:
                 continue
@@ -204,6 +208,7 @@ class Map(MapView):
             keeps[np.unique(winner, return_index=True)[1]] = True  # of several the first
             keeps &= ~taken[winner]
             ids[moved] = np.where(keeps, winner, -1)
+            self._sights.note(k, winner[keeps])
             own.observations[winner[keeps]] += 1
         own.alive[losers] = False
         own.alias[losers] = winners
@@ -216,8 +221,9 @@ class Map(MapView):
             return
         self._own.alive[ids] = False
         dead = self.mask(ids)
-        for state in self._states:
-            state.landmark_ids[dead[state.landmark_ids]] = -1
+        for k in self._sights.candidates(dead):
+            seen = self._states[k].landmark_ids
+            seen[dead[seen]] = -1
 
     def forget_observations(self, keyframe_ids: Ints, features: Ints) -> None:
         """Drop single observations, ``(N,)`` each; landmarks left with none are removed."""
@@ -261,9 +267,13 @@ class Map(MapView):
         moves = self.landmarks.alive.copy()
         if adjusted is not None:
             moves[adjusted.ids] = False
+        is_moved = np.zeros(len(self._states), dtype=bool)
+        is_moved[keyframe_ids] = True
+        riders = np.flatnonzero(is_moved[self.landmarks.anchor_keyframe] & moves)
+        anchor = self.landmarks.anchor_keyframe[riders]
         for k, T_new in zip(keyframe_ids, T_camera_world, strict=True):
             state = self._states[k]
-            anchored = np.flatnonzero((self.landmarks.anchor_keyframe == k) & moves)
+            anchored = riders[anchor == k]
             T_world_before = invert(T_new) @ state.T_camera_world
             R = T_world_before[:3, :3]
             own.position_w[anchored] = transform(T_world_before, own.position_w[anchored])
@@ -329,6 +339,7 @@ class Map(MapView):
             state.id += first_keyframe
             state.landmark_ids = np.where(state.landmark_ids >= 0, state.landmark_ids + first_landmark, -1)
         self._states += other._states
+        self._sights.rebuild(state.landmark_ids for state in self._states)
         self.keyframes = (*self.keyframes, *other.keyframes)
         self.starts |= {first_keyframe + start for start in other.starts}
         return first_keyframe, first_landmark
@@ -336,8 +347,9 @@ class Map(MapView):
     def _refresh_views(self, ids: Ints) -> None:
         """Recompute how landmarks are seen from their anchor keyframes."""
         own = self._own
-        centers = np.stack([keyframe.center_w for keyframe in self.keyframes])
-        offset = own.position_w[ids] - centers[own.anchor_keyframe[ids]]
+        anchors, anchor = np.unique(own.anchor_keyframe[ids], return_inverse=True)
+        centers = np.array([self.keyframes[k].center_w for k in anchors.tolist()]).reshape(-1, 3)
+        offset = own.position_w[ids] - centers[anchor]
         distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
         own.distance_m[ids] = distance
         own.direction_w[ids] = offset / distance[:, None]
@@ -370,6 +382,7 @@ class Map(MapView):
         self.landmarks = self._own.read_only(len(kept))
         for state in self._states:
             state.landmark_ids = now[state.landmark_ids]
+        self._sights.rebuild(state.landmark_ids for state in self._states)
         return now
 
     def spill_images(self) -> None:

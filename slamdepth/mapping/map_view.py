@@ -12,6 +12,7 @@ import numpy as np
 from slamdepth.geometry import transform
 from slamdepth.mapping.landmarks import Landmarks
 from slamdepth.mapping.map_keyframe import KeyframeState, MapKeyframe, read_only
+from slamdepth.mapping.sight_index import SightIndex
 from slamdepth.typing import Floats, Ints
 
 NEAREST_M = 0.05
@@ -38,6 +39,7 @@ class MapView:
 
     def __init__(self) -> None:
         self._states: list[KeyframeState] = []
+        self._sights = SightIndex()
         self._own = Landmarks.empty(_INITIAL_CAPACITY)
         self.landmarks: Landmarks = self._own.read_only(0)
         self.keyframes: tuple[MapKeyframe, ...] = ()
@@ -90,16 +92,20 @@ class MapView:
     def shared_landmarks(self, ids: Ints) -> Ints:
         """How many of the landmarks ``ids`` each keyframe sees, ``(K,)``; -1 counts for none."""
         mask = self.mask(ids)
-        return np.array(
-            [np.count_nonzero(mask[state.landmark_ids]) for state in self._states], dtype=np.int64
-        )
+        shared = np.zeros(len(self._states), dtype=np.int64)
+        for k in self._sights.candidates(mask):
+            shared[k] = np.count_nonzero(mask[self._states[k].landmark_ids])
+        return shared
 
     def shared_with_next(self) -> Ints:
         """How many landmarks each keyframe but the last shares with the next one, ``(K - 1,)``."""
-        return np.array(
-            [np.count_nonzero(self.mask(a.landmark_ids)[b.landmark_ids]) for a, b in pairwise(self._states)],
-            dtype=np.int64,
-        )
+        seen_last = np.full(self.size + 1, -1)
+        shared = np.zeros(max(len(self._states) - 1, 0), dtype=np.int64)
+        for k, (a, b) in enumerate(pairwise(self._states)):
+            seen_last[a.landmark_ids] = k
+            seen_last[-1] = -1
+            shared[k] = np.count_nonzero(seen_last[b.landmark_ids] == k)
+        return shared
 
     def covisibility(self) -> Ints:
         """How many landmarks each two keyframes share, ``(K, K)``; on the diagonal how many each sees."""
@@ -114,8 +120,9 @@ class MapView:
     def times_seen(self, ids: Ints, before: int) -> Ints:
         """How many of the first ``before`` keyframes see each of the landmarks ``ids``, ``(N,)``."""
         times = np.zeros(self.size + 1, dtype=np.int64)
-        for state in self._states[:before]:
-            times[state.landmark_ids] += 1
+        for k in self._sights.candidates(self.mask(ids)):
+            if k < before:
+                times[self._states[k].landmark_ids] += 1
         return times[ids]
 
     def covisible(self, ids: Ints, limit: int, minimum: int = 1) -> list[int]:
