@@ -53,7 +53,7 @@ class Solver:
         cost = by_point(seen.terms)
         for _ in range(_POINT_STEPS):
             before = cost.sum()
-            Hpp, bp = point_system(self._problem.camera, self._sightings, seen)
+            Hpp, bp = point_system(self._problem.camera, self._sightings, state, seen)
             M = inverse_factor(Hpp, 1e-4)
             X = self._moved(state, -transposed_times(M, times(M, bp)).T)
             cost_new = by_point(self._sightings.look(replace(state, X=X)).terms)
@@ -77,7 +77,7 @@ class Solver:
         taken = 0
         for _ in range(limit):
             taken += 1
-            system = linearise(self._problem.camera, self._sightings, seen)
+            system = linearise(self._problem.camera, self._sightings, state, seen)
             improved = False
             for _ in range(4):
                 candidate = self._step(state, system, damping)
@@ -136,12 +136,14 @@ class Solver:
 
     def readout_sigma_s(self, state: State) -> float:
         """Deviation of the readout time, all poses and points being free."""
-        system = linearise(self._problem.camera, self._sightings, self._sightings.look(state))
+        system = linearise(self._problem.camera, self._sightings, state, self._sightings.look(state))
         pull, _ = self._scale_prior(state)
-        return float(np.sqrt(Eliminated(self._sightings, self._cameras, system, pull, 0.0).readout_variance()))
+        return float(
+            np.sqrt(Eliminated(self._sightings, self._cameras, system, pull, 0.0).readout_variance())
+        )
 
     def point_covariance(self, state: State) -> Floats:
         """Covariance ``(P, 3, 3)`` in square metres of each point, given the poses."""
-        Hpp, _ = point_system(self._problem.camera, self._sightings, self._sightings.look(state))
+        Hpp, _ = point_system(self._problem.camera, self._sightings, state, self._sightings.look(state))
         Hpp[[0, 3, 5]] += 1e-3
         return inverse(Hpp)

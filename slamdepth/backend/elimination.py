@@ -12,7 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamdepth.backend.camera_system import CameraSystem
-from slamdepth.backend.normal_equations import CAM, System, motion_of_points, moved_with_camera
+from slamdepth.backend.normal_equations import (
+    CAM,
+    System,
+    coupling,
+    motion_of_points,
+    moved_with_camera,
+)
 from slamdepth.backend.point_blocks import inverse_factor, times, times_transposed, transposed_times
 from slamdepth.backend.sightings import Sightings
 from slamdepth.typing import Floats
@@ -41,21 +47,18 @@ class Eliminated:
         moving = sightings.moving
         self._M = inverse_factor(system.Hpp, damping)
         M = self._M.take(sightings.pt, axis=1)
-        Z = np.empty((CAM, 3, moving))
-        Z[:3] = V = times_transposed(system.W[:3, :, :moving], M[:, :moving])
-        x, y, z = system.P[:, :moving]
-        np.subtract(y * V[2], z * V[1], out=Z[3])
-        np.subtract(z * V[0], x * V[2], out=Z[4])
-        np.subtract(x * V[1], y * V[0], out=Z[5])
+        self._V = V = times_transposed(system.W[:3, :, :moving], M[:, :moving])
         scale = times_transposed(system.W[3:], M)[0]
-        Z[6], self._z_fixed = scale[:, :moving], scale[:, moving:]
-        self._V = V
+        self._z_fixed = scale[:, moving:]
         Hcc = system.Hcc.copy()
         Hcc[:, 6, 6] += pull
         diagonal = np.arange(CAM)
         Hcc[:, diagonal, diagonal] *= 1.0 + damping
         Hcc[:, diagonal, diagonal] += 1e-6
-        self._solve = cameras.solver(Hcc, Z, self._z_fixed)
+        P = system.P
+        self._solve = cameras.solver(
+            Hcc, lambda at: coupling(P[:, at], V[:, :, at], scale[:, at]), self._z_fixed
+        )
 
     def step(self, gradient: Floats) -> Step:
         """The step to the minimum of the quadratic model.

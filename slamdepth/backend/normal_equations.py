@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamdepth.backend.point_blocks import SYMMETRIC
-from slamdepth.backend.sightings import Seen, Sightings
+from slamdepth.backend.sightings import Seen, Sightings, State
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
@@ -65,22 +65,39 @@ class System:
     border: Border | None = None
 
 
-def linearise(camera: Camera, sightings: Sightings, seen: Seen) -> System:
-    """The normal equations of what is seen."""
+def linearise(camera: Camera, sightings: Sightings, state: State, seen: Seen) -> System:
+    """The normal equations of what is seen of a state."""
+    R = sightings.rotations(state)
     G, h = _gram(camera, sightings, seen)
-    W = np.empty((4, *seen.R.shape[1:]))
-    Hpp = _point_blocks(sightings, seen, G, W)
-    np.multiply(seen.R[2], G[5], out=W[3])
-    border = None if sightings.px_rate is None else _border(camera, sightings, seen)
+    W = np.empty((4, *R.shape[1:]))
+    Hpp = _point_blocks(sightings, R, G, W)
+    np.multiply(R[2], G[5], out=W[3])
+    border = None if sightings.px_rate is None else _border(camera, sightings, R, seen)
     Hcc = _camera_blocks(sightings, seen.P, G)
-    return System(Hpp, _turned_by_point(sightings, seen, h), Hcc, W, h, seen.P, border)
+    return System(Hpp, _turned_by_point(sightings, R, h), Hcc, W, h, seen.P, border)
 
 
-def point_system(camera: Camera, sightings: Sightings, seen: Seen) -> tuple[Floats, Floats]:
+def point_system(camera: Camera, sightings: Sightings, state: State, seen: Seen) -> tuple[Floats, Floats]:
     """``Hpp (6, P)`` and ``bp (3, P)`` alone, see :class:`System`."""
+    R = sightings.rotations(state)
     G, h = _gram(camera, sightings, seen)
-    Hpp = _point_blocks(sightings, seen, G, np.empty_like(seen.R))
-    return Hpp, _turned_by_point(sightings, seen, h)
+    return _point_blocks(sightings, R, G, np.empty_like(R)), _turned_by_point(sightings, R, h)
+
+
+def coupling(P: Floats, V: Floats, scale: Floats) -> Floats:
+    """``L V`` of observations at ``P (3, N)``, for ``V (3, 3, N)``, as ``(N, 3, 7)``.
+
+    Args:
+        scale: ``(3, N)`` its row of the depth scale.
+    """
+    x, y, z = P
+    Z = np.empty((CAM, 3, len(x)))
+    Z[:3] = V
+    np.subtract(y * V[2], z * V[1], out=Z[3])
+    np.subtract(z * V[0], x * V[2], out=Z[4])
+    np.subtract(x * V[1], y * V[0], out=Z[5])
+    Z[6] = scale
+    return np.ascontiguousarray(Z.T)
 
 
 def moved_with_camera(P: Floats, v: Floats) -> Floats:
@@ -103,7 +120,7 @@ def motion_of_points(P: Floats, delta: Floats) -> Floats:
     out[0] += turn_y * z - turn_z * y
     out[1] += turn_z * x - turn_x * z
     out[2] += turn_x * y - turn_y * x
-    return out
+    return np.asarray(out)
 
 
 def _gram(camera: Camera, sightings: Sightings, seen: Seen) -> tuple[Floats, Floats]:
@@ -129,9 +146,8 @@ def _gram(camera: Camera, sightings: Sightings, seen: Seen) -> tuple[Floats, Flo
     return G, h
 
 
-def _point_blocks(sightings: Sightings, seen: Seen, G: Floats, W: Floats) -> Floats:
+def _point_blocks(sightings: Sightings, R: Floats, G: Floats, W: Floats) -> Floats:
     """``R^T G R`` by point, ``(6, P)``; ``G R`` is written to ``W (3, 3, N)``."""
-    R = seen.R
     W[0] = G[0] * R[0] + G[1] * R[2]
     W[1] = G[2] * R[1] + G[3] * R[2]
     W[2] = G[1] * R[0] + G[3] * R[1] + G[4] * R[2]
@@ -140,9 +156,8 @@ def _point_blocks(sightings: Sightings, seen: Seen, G: Floats, W: Floats) -> Flo
     ])  # fmt: skip
 
 
-def _turned_by_point(sightings: Sightings, seen: Seen, v: Floats) -> Floats:
+def _turned_by_point(sightings: Sightings, R: Floats, v: Floats) -> Floats:
     """``R^T v`` summed over the observations of each point, ``(3, P)``."""
-    R = seen.R
     turned = R[0] * v[0]
     turned += R[1] * v[1]
     turned += R[2] * v[2]
@@ -150,7 +165,7 @@ def _turned_by_point(sightings: Sightings, seen: Seen, v: Floats) -> Floats:
 
 
 def _camera_blocks(sightings: Sightings, P: Floats, G: Floats) -> Floats:
-    """``L G L^T`` summed over the observations of each slot, ``(K, 7, 7)``; of a fixed one its scale alone."""
+    """``L G L^T`` summed over the observations of each slot, ``(K, 7, 7)``; of fixed ones the scale alone."""
     scale = sightings.by_slot(-G[5:] * P[2])
     x, y, z = P[:, : sightings.moving]
     g00, g02, g11, g12, g22, depth = G[:, : sightings.moving]
@@ -183,7 +198,7 @@ def _camera_blocks(sightings: Sightings, P: Floats, G: Floats) -> Floats:
     return H
 
 
-def _border(camera: Camera, sightings: Sightings, seen: Seen) -> Border:
+def _border(camera: Camera, sightings: Sightings, R: Floats, seen: Seen) -> Border:
     assert sightings.px_rate is not None
     x, y, z = seen.P
     rate = -sightings.px_rate * sightings.inv_sigma_px
@@ -192,5 +207,5 @@ def _border(camera: Camera, sightings: Sightings, seen: Seen) -> Border:
     k = np.empty_like(seen.P)
     k[0], k[1] = whitened[0] * camera.fx / z, whitened[1] * camera.fy / z
     k[2] = -(k[0] * x + k[1] * y) / z
-    Hrp = _turned_by_point(sightings, seen, k)
+    Hrp = _turned_by_point(sightings, R, k)
     return Border(k, Hrp, float((weighted * rate).sum()), float((weighted * seen.r[:2]).sum()))

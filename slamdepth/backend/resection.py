@@ -6,8 +6,8 @@ few points whose depth a network has guessed; it may be turned by ten degrees to
 of steps turns it back. So the cameras that share many points, which geometry alone determines, are kept, and
 the others are added one by one as incremental structure from motion adds them (Schönberger and Frahm,
 "Structure-from-Motion Revisited", CVPR 2016): resection from the points that registered cameras triangulate,
-without predicted depth, a small adjustment, the next camera. As long as resection finds the cameras where they
-are, they stay there and nothing is adjusted. The whole adjustment then decides which start is better.
+without predicted depth, a small adjustment, the next camera. As long as resection finds the cameras where
+they are, they stay there and nothing is adjusted. The whole adjustment then decides which start is better.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class _Growth:
         off = center - d * (d * center).sum(axis=0)
 
         def by_point(values: Floats) -> Floats:
-            return np.bincount(row, values, minlength=len(points))
+            return np.asarray(np.bincount(row, values, minlength=len(points)), dtype=np.float64)
 
         A = np.stack([by_point((i == j) - d[i] * d[j]) for i, j in SYMMETRIC])
         b = np.stack([by_point(axis) for axis in off])
@@ -250,7 +250,7 @@ class _ByIndex:
 
 
 def _exceeds(A: Floats, least: float) -> Bools:
-    """Whether all eigenvalues of symmetric 3 x 3 blocks ``(6, N)`` exceed a number (Sylvester's criterion)."""
+    """Whether all eigenvalues of symmetric blocks ``(6, N)`` exceed a number (Sylvester's criterion)."""
     a00, a01, a02, a11, a12, a22 = A
     a00, a11, a22 = a00 - least, a11 - least, a22 - least
     minor = a00 * a11 - a01 * a01

@@ -34,14 +34,12 @@ class Seen:
     """``N`` observations of a state.
 
     Attributes:
-        R: ``(3, 3, N)`` rotation of the camera of each.
         P: ``(3, N)`` the point in the camera frame, at least ``MIN_DEPTH_M`` away.
         r: ``(3, N)`` whitened residuals: pixel and log depth.
         weight: ``(2, N)`` robust weights of pixel and depth.
         terms: ``(N,)`` robust cost of each.
     """
 
-    R: Floats
     P: Floats
     r: Floats
     weight: Floats
@@ -116,6 +114,10 @@ class Sightings:
         counts = self.counts[: len(of_slot)]
         return np.asarray(np.repeat(np.ascontiguousarray(of_slot.T), counts, axis=1), dtype=np.float64)
 
+    def rotations(self, state: State) -> Floats:
+        """``(3, 3, N)`` of the camera of each observation."""
+        return self.each(state.T[self.cameras, :3, :3].reshape(-1, 9)).reshape(3, 3, -1)
+
     def look(self, state: State) -> Seen:
         """The observations as ``state`` predicts them."""
         camera = self._problem.camera
@@ -146,7 +148,7 @@ class Sightings:
             weight[1] *= weight[1]
         else:
             terms += CAUCHY * CAUCHY * np.log(knee)
-        return Seen(T[:, :3], P, r, weight, terms)
+        return Seen(P, r, weight, terms)
 
     def pixel_chi2(self, state: State) -> Floats:
         """Squared whitened pixel residuals ``(N,)``, infinite for points that are not before the camera."""

@@ -44,11 +44,15 @@ class SightIndex:
             self.note(keyframe, ids)
 
     def candidates(self, is_wanted: Bools) -> list[int]:
-        """Keyframes, ascending, that may see any landmark that ``is_wanted (size + 1,)`` says; the last is none."""
+        """Keyframes, ascending, that may see any of some landmarks.
+
+        Args:
+            is_wanted: ``(size + 1,)`` by landmark; the last stands for none.
+        """
         wanted = is_wanted[:-1]
         starts = np.arange(0, len(wanted), _BUCKET)
         if len(starts) == 0:
             return []
         buckets = np.flatnonzero(np.logical_or.reduceat(wanted, starts))
         buckets = buckets[buckets < self._seen.shape[0]]
-        return np.flatnonzero(self._seen.take(buckets, axis=0).any(axis=0)).tolist()
+        return [int(k) for k in np.flatnonzero(self._seen.take(buckets, axis=0).any(axis=0))]

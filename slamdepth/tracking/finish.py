@@ -32,7 +32,7 @@ _SEARCHED_AGAIN = 6  # neighbours of each keyframe; twice as many gain nothing m
 _PASSES = 3  # after the first adjustment; more than one only while the readout time changes
 _CONVERGED_S = 0.002  # change of the readout time
 _OTHER_START = (5, 10)  # steps of adjustments from two starts, of which the better one is kept
-_MAX_KEYFRAMES = 600  # beyond, the reduced camera system outgrows a laptop's memory
+_READOUT_KEYFRAMES = 200  # latest ones: more tell no more of the readout time
 
 
 @dataclass(frozen=True)
@@ -125,17 +125,11 @@ def optimise_map(
 ) -> FinalMap:
     """Global bundle adjustment and metric scale."""
     notes: list[str] = []
-    count = len(map_.keyframes)
-    if config.bundle.final and 3 <= count <= _MAX_KEYFRAMES:
-        if _adjust_all(map_, integration, frames, shutter):
-            notes.append(
-                "keyframes that share few landmarks were re-registered from those that share many: their "
-                "poses while the tracker ran were wrong"
-            )
-    elif count > _MAX_KEYFRAMES:
+    is_adjusted = config.bundle.final and len(map_.keyframes) >= 3
+    if is_adjusted and _adjust_all(map_, integration, frames, shutter):
         notes.append(
-            f"the final adjustment of the whole map was left out: {count} keyframes, "
-            f"at most {_MAX_KEYFRAMES} fit"
+            "keyframes that share few landmarks were re-registered from those that share many: their "
+            "poses while the tracker ran were wrong"
         )
     if taken_back := integration.loops.taken_back:
         notes.append(f"{taken_back} loops were taken back: what the map had seen contradicted them")
@@ -162,7 +156,7 @@ def _adjust_all(
     for n in range(_PASSES):
         before_s = shutter.readout_s
         if shutter.is_estimated:
-            adjuster.estimate_readout(every)
+            adjuster.estimate_readout(every[-_READOUT_KEYFRAMES:])
         has_converged = abs(shutter.readout_s - before_s) < _CONVERGED_S
         if n > 0 and has_converged:
             break
