@@ -12,7 +12,7 @@ from slamdepth.backend.bundle import bundle_adjust
 def test_solved_by_iteration_a_long_map_becomes_as_good_as_factorised() -> None:
     problem, truth = adjustment.corridor(160, points=100)
     whole, iterated = (adjustment.measure(problem, truth, iterative=n) for n in (False, True))
-    assert whole.after_m < 0.5 * whole.before_m
+    assert whole.after_m < 0.7 * whole.before_m
     assert iterated.after_m < 1.2 * whole.after_m
     assert iterated.keyframes == 160
 

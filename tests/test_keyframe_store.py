@@ -244,6 +244,17 @@ def test_compacting_the_landmarks_changes_nothing(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_array_equal(sparse.points_m, compact.points_m)
 
 
+def test_what_old_frames_saw_is_forgotten_at_little_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = scene.Run(scene.frames())
+    monkeypatch.setattr(frame_log, "_REMEMBERED", 5)
+    forgotten = scene.Run(scene.frames())
+    assert forgotten.slam._active.frames.size_bytes < 0.3 * kept.slam._active.frames.size_bytes
+    whole, part = (run.finish().trajectory for run in (kept, forgotten))
+    np.testing.assert_array_equal(part.timestamps_s, whole.timestamps_s)
+    apart_m = np.linalg.norm(part.T_world_camera[:, :3, 3] - whole.T_world_camera[:, :3, 3], axis=1)
+    assert apart_m.max() < 0.01
+
+
 @pytest.mark.parametrize("depth", ["sensor", "predicted"])
 def test_the_memory_budget_does_not_change_the_run(depth: str) -> None:
     if depth == "sensor":

@@ -43,7 +43,10 @@ def test_a_run_returns_what_it_wrote_and_prints_nothing(
     assert result.summary["settings"]["seed"] == 5
     assert (result.folder / "mesh.ply").is_file()
     stages = list(dict.fromkeys(state.stage for state in states))
-    assert stages == [RunStage.TRACKING, RunStage.OPTIMISING, RunStage.MESHING, RunStage.SCORING]
+    assert stages == [
+        RunStage.TRACKING, RunStage.OPTIMISING, RunStage.MESHING, RunStage.DRAWING, RunStage.SCORING,
+        RunStage.REPORTING,
+    ]  # fmt: skip
     assert capfd.readouterr() == ("", "")
     assert "RunResult(" in repr(result)
     assert "keyframes=(" not in repr(result)

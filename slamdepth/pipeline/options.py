@@ -68,7 +68,9 @@ class RunStage(str, Enum):
     OPTIMISING = "optimising"
     MARKERS = "looking for markers"
     MESHING = "meshing"
+    DRAWING = "drawing the mesh"
     SCORING = "scoring"
+    REPORTING = "writing the report"
 
 
 @dataclass(frozen=True)

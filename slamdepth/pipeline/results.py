@@ -78,6 +78,8 @@ def write_keyframe_mesh(
         return None, (), mesh.notes
     mesh.save(path)
     counts = MeshCounts(len(mesh.vertices_m), len(mesh.triangles))
+    if with_images:
+        progress(RunProgress(RunStage.DRAWING))
     images = render_mesh_images(mesh, reconstruction) if with_images else ()
     return counts, images, mesh.notes
 

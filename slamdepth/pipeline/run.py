@@ -240,6 +240,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     optional = (("mesh.ply", mesh), ("mesh.png", mesh_images), ("depth_scale.yaml", scale.fit))
     absent = {name for name, is_there in optional if not is_there}
     files = {name: what for name, what in FILES.items() if name not in absent}
+    tell(RunProgress(RunStage.REPORTING))
     summary = write_report(
         folder.path,
         ReportData(

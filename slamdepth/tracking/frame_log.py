@@ -23,6 +23,7 @@ from slamdepth.typing import Floats, Floats32, Ints
 _MIN_MATCHES = 30
 _MAX_GAP_S = 0.2  # frames farther apart say little of the velocity between them
 _PRUNE_AT = 256  # frames, then always twice as many
+_REMEMBERED = 18_000  # latest frames, ten minutes, whose matches are kept: 5.5 KiB each
 _MAX_SHIFT_SHARE = 0.1  # of the scene's distance: a refinement is no relocation
 
 
@@ -54,6 +55,7 @@ class _Placed:
     px: Floats32
     phase: Floats32
     sigma_px: Floats32
+    is_settled: bool = False
 
     @property
     def keyframe(self) -> int:
@@ -63,7 +65,8 @@ class _Placed:
 class FrameLog:
     """Placed frames, relative to a keyframe each, with what they saw (kiss-slam's local frames).
 
-    Whatever moves a keyframe moves its frames. Pixels are kept as the shutter took them.
+    Whatever moves a keyframe moves its frames. Pixels are kept as the shutter took them, of the latest
+    frames: older ones have been refined in the map around them, and move with their keyframe only.
 
     Attributes:
         withdrawn: number of frames that were placed and have no pose any more.
@@ -75,6 +78,7 @@ class FrameLog:
         self._map = map_
         self._placed: list[_Placed] = []
         self.withdrawn = 0
+        self._settled = 0  # so many of the first frames are settled, or more
         # ids are remembered as they were then, offset by all ids that compactions have renumbered
         self._ids_now = np.zeros(0, dtype=np.int32)
         self._prune_at = _PRUNE_AT
@@ -133,6 +137,7 @@ class FrameLog:
         if times_s:
             before = len(self._placed)
             kept = [p for p in self._placed if p.is_keyframe or p.timestamp_s not in times_s]
+            self._settled = 0
             self._placed, self.withdrawn = kept, self.withdrawn + before - len(kept)
 
     def renumber(self, ids_now: Ints) -> None:
@@ -154,6 +159,34 @@ class FrameLog:
             placed.landmark_ids = placed.landmark_ids + np.int32(first_landmark + len(self._ids_now))
         self.withdrawn += other.withdrawn
         self._placed = sorted(self._placed + other._placed, key=lambda placed: placed.timestamp_s)
+        self._settled = 0
+
+    def settle(self, readout_s: float) -> None:
+        """Refine frames that were placed long ago in the map as it is, and forget what they saw.
+
+        Args:
+            readout_s: see :meth:`refine`.
+        """
+        while self._settled < len(self._placed) - _REMEMBERED:
+            n, placed = self._settled, self._placed[self._settled]
+            self._settled += 1
+            if placed.is_settled:
+                continue
+            placed.is_settled = True
+            if not placed.is_keyframe:
+                velocity = self._velocity(n) if readout_s else None
+                self._refine(placed, self._map.resolve(self._now(placed.landmark_ids)), velocity, readout_s)
+            none = np.zeros(0, dtype=np.float32)
+            placed.landmark_ids, placed.px = np.zeros(0, dtype=np.int32), np.zeros((0, 2), dtype=np.float32)
+            placed.phase = placed.sigma_px = none
+
+    def _now(self, ids: NDArray[np.int32]) -> Ints:
+        """The present ids of landmarks that were remembered, -1 where they are gone."""
+        count = len(self._ids_now)
+        if count == 0:
+            return ids.astype(np.int64)
+        was_before = ids < count
+        return np.where(was_before, self._ids_now[np.where(was_before, ids, 0)], ids - count)
 
     def _prune(self) -> None:
         """Forget what was seen of landmarks that are gone."""
@@ -213,14 +246,15 @@ class FrameLog:
         Args:
             readout_s: of the rolling shutter, 0 for a global one.
         """
-        ids_now = np.concatenate([self._ids_now, np.arange(self._map.size)])
         velocities = [self._velocity(n) for n in range(len(self._placed))] if readout_s else []
         for n, placed in enumerate(self._placed):
             if placed.is_keyframe:
                 placed.pose = AnchoredPose(placed.pose.keyframe, np.eye(4), placed.pose.keyframe.unit)
                 continue
+            if placed.is_settled:
+                continue
             velocity = velocities[n] if readout_s else None
-            self._refine(placed, self._map.resolve(ids_now[placed.landmark_ids]), velocity, readout_s)
+            self._refine(placed, self._map.resolve(self._now(placed.landmark_ids)), velocity, readout_s)
 
     def _refine(self, placed: _Placed, ids: Ints, velocity: Floats | None, readout_s: float) -> None:
         landmarks = self._map.landmarks

@@ -150,6 +150,7 @@ class MapTracker(MapParts):
             follows_motion=follows_motion,
             quality=placed.quality,
         )
+        self.frames.settle(self.shutter.readout_s)
         return placed
 
     def _placed(
