@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure how memory grows with the length of a sequence, which is played forth and back.
+"""Measure how memory and processor time grow with the length of a sequence, which is played forth and back.
 
     python -m benchmarks.memory --data DIR --sequence NAME --depth sensor --frames 5000
 
-Prints one line per thousand frames: keyframes, memory of the process, and bytes of the tracker's arrays by
-kind. Below the table: what a keyframe and a frame add once the images of old keyframes are spilled to disk,
-and what ten minutes of unseen ground would need. That figure supposes keyframes as often as in the first
-play: played back, a sequence shows known ground.
+Prints one line per thousand frames: keyframes, processor time of each frame since the line before, memory of
+the process, and bytes of the tracker's arrays by kind. Below the table: what finishing took, what a keyframe
+and a frame add once the images of old keyframes are spilled to disk, and what ten minutes of unseen ground
+would need. That figure supposes keyframes as often as in the first play: played back, a sequence shows known
+ground. ``--set tracking.keyframe_overlap=0.97`` makes keyframes of known ground as well, and so a large map.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -27,8 +29,9 @@ from benchmarks.command import errors_in_one_line, parser_of
 from benchmarks.markdown import markdown_table
 from benchmarks.record import environment, write_benchmark
 from benchmarks.seeded import seeded_depth_model
+from benchmarks.sub_sequences import setting
 from benchmarks.worker import memory_mib
-from slamdepth.config import Config
+from slamdepth.config import Config, merge
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.matching import PixelGrid
@@ -88,12 +91,14 @@ class Sample:
     """The tracker and its process after a number of frames.
 
     Attributes:
+        cpu_ms: processor time of each frame since the sample before, all threads, without reading.
         process_mib: resident memory of the process.
         tracker: MiB of the tracker's arrays.
     """
 
     frames: int
     keyframes: int
+    cpu_ms: float
     process_mib: float
     tracker: TrackerMemory
 
@@ -121,15 +126,25 @@ def measure(
     with_depth = asked.depth == "sensor"
     samples: list[Sample] = []
     lost = 0
+    spent_s, sampled = 0.0, 0
     for n, index in enumerate(itertools.islice(forth_and_back(length), asked.frames), 1):
         frame = dataset.read(index, with_depth=with_depth)
+        start = time.process_time()
         result = tracker.step(replace(frame, index=n - 1, timestamp_s=(n - 1) / dataset.camera.fps))
+        tracker._workers.between.wait()
+        spent_s += time.process_time() - start
         lost += result.T_world_camera is None
         if n == length or n % asked.every == 0 or n == asked.frames:
-            samples.append(Sample(n, result.keyframes, memory_mib("VmRSS"), TrackerMemory.of(tracker)))
+            cpu_ms = 1e3 * spent_s / (n - sampled)
+            spent_s, sampled = 0.0, n
+            samples.append(
+                Sample(n, result.keyframes, cpu_ms, memory_mib("VmRSS"), TrackerMemory.of(tracker))
+            )
             report(samples[-1])
+    start = time.process_time()
     done = tracker.finish()
     figures = {
+        "finish_cpu_s": time.process_time() - start,
         "lost": lost,
         "loops": done.statistics.loop_closures,
         "resident_after_finish_mib": memory_mib("VmRSS"),
@@ -167,8 +182,8 @@ def growth(samples: list[Sample], first_play: int) -> dict[str, float]:
 def table(samples: list[Sample]) -> str:
     """The samples as Markdown, sizes in MiB."""
     kinds = [name.replace("_", " ") for name in TrackerMemory.__dataclass_fields__]
-    rows = ((s.frames, s.keyframes, s.process_mib, *asdict(s.tracker).values()) for s in samples)
-    headings = ["frames", "keyframes", "process MiB", *kinds]
+    rows = ((s.frames, s.keyframes, s.cpu_ms, s.process_mib, *asdict(s.tracker).values()) for s in samples)
+    headings = ["frames", "keyframes", "CPU ms", "process MiB", *kinds]
     return markdown_table(headings, [[f"{value:.0f}" for value in row] for row in rows])
 
 
@@ -183,6 +198,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--length", type=int, metavar="N", help="turn back after N frames")
     parser.add_argument("--every", type=int, default=1000, metavar="N", help="frames per line")
     parser.add_argument("--budget", type=float, metavar="MIB", help="map.keyframe_memory_mib")
+    parser.add_argument("--set", type=setting, action="append", default=[], dest="settings",
+                        metavar="SECTION.KEY=VALUE", help="a setting; can be repeated")  # fmt: skip
     parser.add_argument("--output", "-o", type=Path, metavar="FILE", help="write all figures here, as JSON")
     asked = parser.parse_args(arguments)
     for name in ("frames", "every", "length"):
@@ -190,8 +207,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.error(f"--{name} must be at least 1, got {value}")
     console = Console(stderr=True)
     begun = environment()
-    changed: dict[str, Any] = {} if asked.budget is None else {"keyframe_memory_mib": asked.budget}
-    config = Config.from_dict({"map": changed}, origin="--budget")
+    changed: dict[str, Any] = {} if asked.budget is None else {"map": {"keyframe_memory_mib": asked.budget}}
+    for one in asked.settings:
+        changed = merge(changed, one)
+    config = Config.from_dict(changed, origin="--budget and --set")
     dataset = open_dataset(asked.data / asked.sequence)
     model = seeded_depth_model(asked.depth, config)
     samples, figures = measure(

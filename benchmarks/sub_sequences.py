@@ -153,7 +153,8 @@ def _whole_numbers(text: str) -> list[int]:
     return [int(part) for part in text.split(",") if part]
 
 
-def _setting(text: str) -> dict[str, Any]:
+def setting(text: str) -> dict[str, Any]:
+    """``SECTION.KEY=VALUE`` as nested settings."""
     name, equals, value = text.partition("=")
     section, dot, key = name.partition(".")
     if not (section and dot and key and equals):
@@ -170,7 +171,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--strides", type=_whole_numbers, metavar="N,...", default=[2, 3],
                         help="every Nth frame, from the first start (default: 2,3)")  # fmt: skip
     parser.add_argument("--depth", default="dinov2", help="'sensor' or a depth model (default: dinov2)")
-    parser.add_argument("--set", type=_setting, action="append", default=[], dest="settings",
+    parser.add_argument("--set", type=setting, action="append", default=[], dest="settings",
                         metavar="SECTION.KEY=VALUE", help="a setting; can be repeated")  # fmt: skip
     parser.add_argument("--corruption", default="as it is", metavar="NAME",
                         help="one of benchmarks.robustness, for every sub-sequence")  # fmt: skip

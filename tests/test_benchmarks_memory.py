@@ -22,8 +22,8 @@ def test_the_ends_come_once(count: int, expected: list[int]) -> None:
 
 def test_growth_is_that_of_new_ground() -> None:
     samples = [
-        Sample(100, 10, 220.0, TrackerMemory(20.0, 1.0, 1.0, observations=0.5, on_disk=1.0)),
-        Sample(400, 20, 340.0, TrackerMemory(30.0, 2.0, 2.0, observations=2.0, on_disk=4.0)),
+        Sample(100, 10, 20.0, 220.0, TrackerMemory(20.0, 1.0, 1.0, observations=0.5, on_disk=1.0)),
+        Sample(400, 20, 20.0, 340.0, TrackerMemory(30.0, 2.0, 2.0, observations=2.0, on_disk=4.0)),
     ]
     figures = growth(samples, first_play=100)
     assert figures["keyframe_mib"] == pytest.approx(0.2)
