@@ -2,7 +2,7 @@
 """Loops of the tracker compiled by numba, where it can be imported.
 
 Each has a twin in NumPy or OpenCV that is used without numba. They take one core and release the interpreter
-lock. The first run compiles them, which takes some 15 seconds; later ones read them from numba's cache on disk.
+lock. The first run compiles them, which takes some 15 seconds; later ones read them from numba's cache.
 """
 
 from __future__ import annotations
