@@ -75,7 +75,8 @@ class TrackerMemory:
 
 
 def _array_bytes(holder: object) -> int:
-    return sum(array.nbytes for array in _arrays(holder))
+    """Bytes of the arrays of ``holder``; views of one array count once."""
+    return sum({array.__array_interface__["data"][0]: array.nbytes for array in _arrays(holder)}.values())
 
 
 def _arrays(holder: object) -> Iterator[NDArray[Any]]:

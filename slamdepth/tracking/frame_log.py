@@ -113,7 +113,8 @@ class FrameLog:
         """
         reference = self._map.keyframes[-1]
         seen = placement.landmark_ids
-        if not is_keyframe and np.count_nonzero(np.isin(reference.landmark_ids, seen)) < _MIN_MATCHES:
+        shared = np.count_nonzero(np.isin(reference.landmark_ids, placement.found_ids))
+        if not is_keyframe and shared < _MIN_MATCHES:
             best = self._map.covisible(seen, 1)
             reference = self._map.keyframes[best[0]] if best else reference
         # a keyframe's pose is the map's own, whatever it saw
