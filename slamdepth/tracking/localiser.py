@@ -18,7 +18,7 @@ from slamdepth.frontend.pose import (
 from slamdepth.frontend.ray_pose import RaySighting, pose_with_depths
 from slamdepth.frontend.ray_start import pose_from_rays
 from slamdepth.frontend.wide_pose import directional_pose, pose_from_reference
-from slamdepth.geometry import CHI2_2DOF_95
+from slamdepth.geometry import CHI2_2DOF_99
 from slamdepth.mapping.map_view import MapView
 from slamdepth.mapping.placement import PlacedBy, Placement
 from slamdepth.tracking.landmark_search import SearchWindow, Visible, match_landmarks, visible_landmarks
@@ -211,7 +211,7 @@ class Localiser:
     def _is_loose(self, placement: Placement, estimate: PoseEstimate) -> bool:
         found_w = self._map.landmarks.position_w[placement.found_ids]
         errs_px = corner_deviation_px(self._camera, placement.T_camera_world, found_w, estimate.information)
-        return bool(errs_px * np.sqrt(CHI2_2DOF_95) > POSE_PX)
+        return bool(errs_px * np.sqrt(CHI2_2DOF_99) > POSE_PX)
 
     def _sighting(self, features: Features, ids: Ints, at: Ints) -> RaySighting:
         landmarks = self._map.landmarks
