@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
-from slamdepth.depth.registry import create_depth_model
+from slamdepth.depth.metric import configured_model
 from slamdepth.pipeline.run import seed_everything, seed_torch
 
 
@@ -16,13 +16,7 @@ def seeded_depth_model(name: str, config: Config) -> DepthModel:
         WeightsError: its weights are missing.
     """
     seed_everything(config.seed)
-    model = create_depth_model(
-        name,
-        device=config.device,
-        seed=config.seed,
-        weights=config.depth.weights,
-        precision=config.depth.precision,
-        input_px=config.depth.input_px,
-    )
+    depth = config.depth.model_copy(update={"name": name})
+    model = configured_model(config.model_copy(update={"depth": depth}))
     seed_torch(config.seed)
     return model

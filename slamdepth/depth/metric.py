@@ -10,14 +10,14 @@ from slamdepth.errors import ConfigError
 from slamdepth.types import DepthKind
 
 
-def metric_model(model: DepthModel | None, config: Config) -> DepthModel:
-    """``model``, or else the one that ``config.depth.name`` names.
+def configured_model(config: Config) -> DepthModel:
+    """The depth model that ``config`` names, with its settings.
 
     Raises:
-        ConfigError: no model has that name, or its predictions are relative.
+        ConfigError: no model has that name, or it lacks a setting that was chosen.
         WeightsError: its weights are not there.
     """
-    model = model or create_depth_model(
+    return create_depth_model(
         config.depth.name,
         device=config.device,
         seed=config.seed,
@@ -25,6 +25,16 @@ def metric_model(model: DepthModel | None, config: Config) -> DepthModel:
         precision=config.depth.precision,
         input_px=config.depth.input_px,
     )
+
+
+def metric_model(model: DepthModel | None, config: Config) -> DepthModel:
+    """``model``, or else the one that ``config.depth.name`` names.
+
+    Raises:
+        ConfigError: no model has that name, or its predictions are relative.
+        WeightsError: its weights are not there.
+    """
+    model = model or configured_model(config)
     check_metric(model)
     return model
 

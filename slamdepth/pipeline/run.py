@@ -17,8 +17,7 @@ from slamdepth.config import Config, merge
 from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.depth.base import DepthModel, is_sensor
-from slamdepth.depth.metric import with_chosen_model
-from slamdepth.depth.registry import create_depth_model
+from slamdepth.depth.metric import configured_model, with_chosen_model
 from slamdepth.depth.scale_file import write_scale
 from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.frontend.features import feature_weights
@@ -148,14 +147,7 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     check_scale_options(dataset, config, indices)
     folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite)
     seed_everything(config.seed)
-    given = create_depth_model(
-        config.depth.name,
-        device=config.device,
-        seed=config.seed,
-        weights=config.depth.weights,
-        precision=config.depth.precision,
-        input_px=config.depth.input_px,
-    )
+    given = configured_model(config)
     if is_sensor(given):
         if not dataset.has_depth:
             raise DatasetError(
