@@ -37,8 +37,10 @@ class GravityConsensus:
         """
         self._queries += 1
         gravity_w = self._agreed(_MIN_GUESSES)
-        is_asked = self.in_world() is None or self._queries % _CHECK_EVERY == 0
-        return None if gravity_w is None else np.asarray(R_world_camera.T @ gravity_w), is_asked
+        if gravity_w is None:
+            return None, True
+        is_known = len(self._estimates_w) >= _MIN_ESTIMATES
+        return np.asarray(R_world_camera.T @ gravity_w), not is_known or self._queries % _CHECK_EVERY == 0
 
     def add(self, R_world_camera: Floats, gravity: Floats, confidence: float) -> None:
         """Add the estimate of one image.
