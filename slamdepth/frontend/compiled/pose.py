@@ -18,6 +18,23 @@ _Intrinsics = tuple[float, float, float, float]
 
 
 @inlined
+def _in_camera(T: Floats, p: Floats) -> tuple[float, float, float]:
+    """A point ``p (3,)`` in the frame of a camera."""
+    x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+    y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+    z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+    return x, y, z
+
+
+@inlined
+def _symmetrise(H: Floats) -> None:
+    """Copy the lower triangle of ``H (6, 6)`` to the upper one."""
+    for m in range(6):
+        for n in range(m):
+            H[n, m] = H[m, n]
+
+
+@inlined
 def _whiten(
     T: Floats,
     points_w: Floats,
@@ -31,9 +48,8 @@ def _whiten(
     fx, fy = lens[0], lens[1]
     for i in range(len(points_w)):
         p = points_w[i]
-        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
-        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-        z = max(T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3], nearest)
+        x, y, z = _in_camera(T, p)
+        z = max(z, nearest)
         su, sv = fx / z, fy / z
         u0, v0 = su * (T[0, 0] - x / z * T[2, 0]), sv * (T[1, 0] - y / z * T[2, 0])
         u1, v1 = su * (T[0, 1] - x / z * T[2, 1]), sv * (T[1, 1] - y / z * T[2, 1])
@@ -61,9 +77,8 @@ def _row(
 ) -> tuple[float, float]:
     """Whitened residual of one match; its derivatives by the left perturbation into ``J (2, 6)``."""
     fx, fy, cx, cy = lens
-    x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
-    y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-    z = max(T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3], nearest)
+    x, y, z = _in_camera(T, p)
+    z = max(z, nearest)
     du, dv = fx * x / z + (cx - px[0]), fy * y / z + (cy - px[1])
     a, b, c = W[0], W[1], W[2]
     right0, right1, down = a * fx / z, b * fx / z, c * fy / z
@@ -106,9 +121,7 @@ def _accumulate(
             g[m] += wu * ru + wv * rv
             for n in range(m + 1):
                 H[m, n] += wu * J[0, n] + wv * J[1, n]
-    for m in range(6):
-        for n in range(m):
-            H[n, m] = H[m, n]
+    _symmetrise(H)
 
 
 @inlined
@@ -207,7 +220,7 @@ def refine(
         usable = 0
         for i in range(count):
             p = points_w[i]
-            z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+            z = _in_camera(T, p)[2]
             used[i] = active[i] and z > nearest_m
             usable += used[i]
         if usable >= 4:
@@ -223,7 +236,7 @@ def refine(
             T_whitened = T
         for i in range(count):
             p = points_w[i]
-            z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+            z = _in_camera(T, p)[2]
             ru, rv = _row(T, p, px[i], W[i], lens, nearest_m, J)
             active[i] = z > nearest_m and ru * ru + rv * rv < gate
     return True, T, active, H
@@ -262,9 +275,7 @@ def equations_by_cell(
             sums[cell, m] += J[0, m] * ru + J[1, m] * rv
             for n in range(m + 1):
                 H[m, n] += J[0, m] * J[0, n] + J[1, m] * J[1, n]
-    for m in range(6):
-        for n in range(m):
-            H[n, m] = H[m, n]
+    _symmetrise(H)
     return H, sums[is_filled]
 
 
