@@ -15,7 +15,18 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from slamdepth.cli import data_stats, depth, eval_depth, evaluate, run, scale, synth, train, weights
+from slamdepth.cli import (
+    data_stats,
+    depth,
+    eval_depth,
+    evaluate,
+    evaluate_mesh,
+    run,
+    scale,
+    synth,
+    train,
+    weights,
+)
 from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_verbose
 from slamdepth.errors import SlamdepthError
 
@@ -34,6 +45,7 @@ app.command("run")(run.run_command)
 app.command("scale")(scale.scale_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)
+app.command("evaluate-mesh")(evaluate_mesh.evaluate_mesh_command)
 app.command("depth")(depth.depth_command)
 app.command("eval-depth")(eval_depth.eval_depth_command)
 app.command("train-depth")(train.train_depth_command)

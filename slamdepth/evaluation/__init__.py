@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scores: trajectories against a ground truth, depth maps against a sensor, runs without either."""
+"""Scores: trajectories and surfaces against the truth, depth maps against a sensor, runs without either."""
 
 from __future__ import annotations
 
@@ -11,6 +11,14 @@ from slamdepth.evaluation.health_facts import MapFacts, RunFacts
 from slamdepth.evaluation.health_numbers import HealthNumbers
 from slamdepth.evaluation.health_rules import Verdict
 from slamdepth.evaluation.health_spans import HealthSpan, SpanKind
+from slamdepth.evaluation.surface import (
+    AlignedScores,
+    Surface,
+    SurfaceScore,
+    score_surface,
+    surface_figures,
+    vertex_errors_m,
+)
 from slamdepth.evaluation.trajectory import (
     MAX_DIFFERENCE_S,
     AbsoluteError,
@@ -22,6 +30,7 @@ from slamdepth.evaluation.trajectory import (
 __all__ = [
     "MAX_DIFFERENCE_S",
     "AbsoluteError",
+    "AlignedScores",
     "DepthErrors",
     "DepthJudge",
     "DepthJudgement",
@@ -36,9 +45,14 @@ __all__ = [
     "RelativeError",
     "RunFacts",
     "SpanKind",
+    "Surface",
+    "SurfaceScore",
     "TrajectoryScore",
     "Verdict",
     "judge_run",
     "mean_over_sets",
+    "score_surface",
     "score_trajectory",
+    "surface_figures",
+    "vertex_errors_m",
 ]

@@ -40,7 +40,7 @@ def trusted_depth(keyframe: Keyframe, max_depth_m: float) -> Floats32:
     prediction = keyframe.prediction.load()
     depth_m = keyframe.in_metres(prediction)
     depth = np.where(np.isfinite(depth_m), depth_m, np.float32(0.0)).astype(np.float32)
-    drop = (depth <= 0.0) | (depth > max_depth_m) | _at_jumps(depth)
+    drop = (depth <= 0.0) | (depth > max_depth_m) | at_jumps(depth)
     sigma_log = None if prediction.is_sensor else prediction.sigma_log
     if sigma_log is not None:
         sigma = np.where(np.isfinite(sigma_log), sigma_log, np.inf)
@@ -52,7 +52,8 @@ def trusted_depth(keyframe: Keyframe, max_depth_m: float) -> Floats32:
     return depth
 
 
-def _at_jumps(depth: Floats32) -> NDArray[np.bool_]:
+def at_jumps(depth: Floats32) -> NDArray[np.bool_]:
+    """Mask of the pixels of depth ``(H, W)`` next to a jump, which sensors and networks smear."""
     jump = np.zeros(depth.shape, bool)
     for a, b in (
         ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),

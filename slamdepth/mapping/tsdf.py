@@ -89,7 +89,7 @@ def fuse_keyframes(
             f"no mesh: no connected piece has {settings.min_component_triangles} triangles; "
             "lower map.min_component_triangles",
         )
-    vertices, triangles, colors = _ordered(vertices, triangles, colors)
+    vertices, triangles, colors = ordered(vertices, triangles, colors)
     return Mesh(vertices, triangles, np.clip(colors, 0.0, 1.0), tuple(notes))
 
 
@@ -210,7 +210,7 @@ def _without_small_components(
     return vertices[used], renamed.reshape(-1, 3).astype(np.int32), colors[used]
 
 
-def _ordered(
+def ordered(
     vertices: NDArray[np.float32], triangles: NDArray[np.int32], colors: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.float32]]:
     """Sort vertices and triangles: Open3D's order depends on its threads."""

@@ -11,6 +11,7 @@ from slamdepth.config import Config
 from slamdepth.datasets import Dataset
 from slamdepth.errors import SlamdepthError
 from slamdepth.io import write_tum_trajectory
+from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.folder import RunFolder
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
@@ -55,17 +56,17 @@ def write_trajectories(folder: RunFolder, maps: Sequence[Reconstruction]) -> Non
 
 def write_mesh(
     folder: RunFolder, number: int, reconstruction: Reconstruction, config: Config, tell: ProgressCallback
-) -> tuple[MeshCounts | None, tuple[MeshImage, ...], tuple[str, ...]]:
+) -> tuple[Mesh | None, tuple[MeshImage, ...], tuple[str, ...]]:
     """Write the ``mesh.ply`` of one map, and the ``mesh.png`` of the largest.
 
     Args:
         number: of the map, 1 for the largest.
 
     Returns:
-        The size of the mesh, images of it, and notes; trouble becomes a note.
+        The mesh, images of it, and notes; trouble becomes a note.
     """
     tell(RunProgress(RunStage.MESHING))
-    mesh: MeshCounts | None = None
+    mesh: Mesh | None = None
     images: tuple[MeshImage, ...] = ()
     place = folder.make_map_folder(number)
     try:
@@ -105,8 +106,8 @@ def finish_others(
     notes: list[str] = []
     for number, one in enumerate(others, start=2):
         if mesh:
-            counts, _, lines = write_mesh(folder, number, one.reconstruction, config, tell)
-            one = replace(one, mesh=counts)
+            made, _, lines = write_mesh(folder, number, one.reconstruction, config, tell)
+            one = replace(one, mesh=MeshCounts.of(made))
             notes += lines
         score, lines = judge_trajectory(dataset, one.reconstruction.trajectory, is_measured=is_measured)
         found.append(replace(one, trajectory_score=score))

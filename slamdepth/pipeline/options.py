@@ -70,6 +70,7 @@ class RunStage(str, Enum):
     MESHING = "meshing"
     DRAWING = "drawing the mesh"
     SCORING = "scoring"
+    COMPARING = "scoring the mesh"
     REPORTING = "writing the report"
 
 
@@ -79,7 +80,8 @@ class RunProgress:
 
     Attributes:
         stage: what the run is doing.
-        done, total: frames while tracking, fitting and looking for markers, keyframes while meshing.
+        done, total: frames while tracking, fitting, looking for markers and scoring the mesh, keyframes
+            while meshing.
         fps: frames per second so far.
         status: of the last frame, None before the first.
         keyframes, loop_closures: totals so far.

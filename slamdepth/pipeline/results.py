@@ -24,9 +24,10 @@ from slamdepth.evaluation import (
     score_trajectory,
 )
 from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
-from slamdepth.report import MeshCounts, MeshImage, ScaleFacts, render_mesh_images
+from slamdepth.report import MeshImage, ScaleFacts, render_mesh_images
 from slamdepth.types import DepthKind, StepResult, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -52,14 +53,14 @@ def write_keyframe_mesh(
     progress: ProgressCallback,
     *,
     with_images: bool = True,
-) -> tuple[MeshCounts | None, tuple[MeshImage, ...], tuple[str, ...]]:
+) -> tuple[Mesh | None, tuple[MeshImage, ...], tuple[str, ...]]:
     """Fuse the keyframes and write the mesh.
 
     Args:
         with_images: also render images of it.
 
     Returns:
-        Its size, or None where there is no surface and no file; images of it; and notes.
+        The mesh, or None where there is no surface and no file; images of it; and notes.
 
     Raises:
         OutputError: ``path`` cannot be written.
@@ -77,11 +78,10 @@ def write_keyframe_mesh(
     if len(mesh.triangles) == 0:
         return None, (), mesh.notes
     mesh.save(path)
-    counts = MeshCounts(len(mesh.vertices_m), len(mesh.triangles))
     if with_images:
         progress(RunProgress(RunStage.DRAWING))
     images = render_mesh_images(mesh, reconstruction) if with_images else ()
-    return counts, images, mesh.notes
+    return mesh, images, mesh.notes
 
 
 def judge_trajectory(

@@ -22,6 +22,7 @@ from slamdepth.depth.scale_file import write_scale
 from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.frontend.features import feature_weights
 from slamdepth.io import write_text
+from slamdepth.mapping.mesh import Mesh
 from slamdepth.pipeline.folder import FILES, MAPS, MAPS_CONTENT, RunFolder, run_log, write_log_to
 from slamdepth.pipeline.maps import finish_others, settle_others, write_mesh, write_trajectories
 from slamdepth.pipeline.options import (
@@ -38,8 +39,9 @@ from slamdepth.pipeline.prediction_scale import (
 )
 from slamdepth.pipeline.results import judge_health, judge_trajectory, score_depth
 from slamdepth.pipeline.scale import settle_scale
+from slamdepth.pipeline.surface import score_mesh
 from slamdepth.pipeline.tracking import AnyTracker, Tracked, track
-from slamdepth.report import MeshCounts, MeshImage, ReportData, write_report
+from slamdepth.report import MeshCounts, MeshImage, ReportData, render_errors, write_report
 
 logger = logging.getLogger(__name__)
 
@@ -213,7 +215,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     reconstruction = replace(reconstruction, others=tuple(one.reconstruction for one in others))
     write_trajectories(folder, (reconstruction, *reconstruction.others))
     notes = [*dataset.notes, *tracked.notes, *scale_notes, *other_notes]
-    mesh: MeshCounts | None = None
+    mesh: Mesh | None = None
     mesh_images: tuple[MeshImage, ...] = ()
     if job.options.mesh:
         mesh, mesh_images, mesh_notes = write_mesh(folder, 1, reconstruction, config, tell)
@@ -229,6 +231,15 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
         dataset, reconstruction.trajectory, is_measured=is_measured
     )
     depth_score, depth_notes = score_depth(dataset, reconstruction.keyframes)
+    surface_scores, errors_m, surface_notes = score_mesh(
+        dataset,
+        job.indices,
+        mesh,
+        trajectory_score,
+        lambda done, total: tell(RunProgress(RunStage.COMPARING, done, total)),
+    )
+    if mesh is not None and errors_m is not None:
+        mesh_images += render_errors(mesh, errors_m, reconstruction)
     optional = (("mesh.ply", mesh), ("mesh.png", mesh_images), ("depth_scale.yaml", scale.fit))
     absent = {name for name, is_there in optional if not is_there}
     files = {name: what for name, what in FILES.items() if name not in absent}
@@ -248,13 +259,14 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
             steps=tracked.steps,
             trajectory_score=trajectory_score,
             depth_score=depth_score,
-            mesh=mesh,
+            mesh=MeshCounts.of(mesh),
+            surface_scores=surface_scores,
             others=others,
             mesh_images=mesh_images,
             skipped_frames=tracked.skipped,
             readable_frames=len(dataset),
             promised_frames=getattr(dataset, "frames_promised", len(dataset)),
-            notes=(*notes, *score_notes, *depth_notes),
+            notes=(*notes, *score_notes, *depth_notes, *surface_notes),
             options=_reported_options(job.options, tracked),
             files={**files, MAPS: MAPS_CONTENT} if others else files,
         ),

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from slamdepth.report.console import run_table, scale_table, trajectory_table
+from slamdepth.report.console import run_table, scale_table, surface_table, trajectory_table
 from slamdepth.report.data import MapData, MeshCounts, ReportData
 from slamdepth.report.html import build_html
-from slamdepth.report.mesh_images import MeshImage, render_mesh_images, write_mesh_png
+from slamdepth.report.mesh_images import MeshImage, render_errors, render_mesh_images, write_mesh_png
 from slamdepth.report.scale import ScaleFacts, ScalePart, ScaleSource
 from slamdepth.report.summary import build_summary
 from slamdepth.report.write import write_report
@@ -21,9 +21,11 @@ __all__ = [
     "ScaleSource",
     "build_html",
     "build_summary",
+    "render_errors",
     "render_mesh_images",
     "run_table",
     "scale_table",
+    "surface_table",
     "trajectory_table",
     "write_mesh_png",
     "write_report",

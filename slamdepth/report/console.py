@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from slamdepth.evaluation import Verdict
+from slamdepth.evaluation.surface import CUT_M
 from slamdepth.report.maps import about_maps, map_lines
 from slamdepth.report.text import MISSING, count, fixed, percent
 
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from slamdepth.depth.scale import ScaleFit
 
     Rows = list[tuple[str, str]]
+
+ALIGNMENTS = (("se3", "SE(3)"), ("sim3", "Sim(3)"))
+"""Keys of the figures of a surface, and names of how the trajectories were aligned."""
 
 
 def run_table(summary: dict[str, Any]) -> Table:
@@ -42,6 +46,8 @@ def run_table(summary: dict[str, Any]) -> Table:
     mesh = summary["mesh"]
     if mesh["vertices"] is not None:
         rows.append(("mesh", f"{count(mesh['vertices'])} vertices, {count(mesh['triangles'])} triangles"))
+    if summary["surface"]["sim3"]["points"] is not None:
+        rows += [(f"mesh, {name}", surface_line(summary["surface"][key])) for key, name in ALIGNMENTS]
     features = f" · features: {summary['features']}" if summary["features"] else ""
     return two_columns(f"{summary['sequence']} · depth: {summary['depth_model']}{features}", rows)
 
@@ -120,6 +126,44 @@ def _score_rows(figures: dict[str, Any], digits: int) -> Rows:
         value = MISSING if trans is None else f"{fixed(trans, digits, 'm')}, {fixed(rot, digits, '°')}"
         rows.append((label, value))
     return rows
+
+
+def surface_line(figures: dict[str, Any]) -> str:
+    """The figures of ``SurfaceScore.to_dict()`` in one line."""
+    f_scores = ", ".join(f"{fixed(one['f_score'], 2)} at {name}" for name, one in figures["within"].items())
+    return (
+        f"F {f_scores}; accuracy {_cm(figures['accuracy']['median_m'])}, "
+        f"completion {_cm(figures['completion']['median_m'])} (medians)"
+    )
+
+
+def surface_table(figures: dict[str, Any], title: str) -> Table:
+    """The figures of ``SurfaceScore.to_dict()``."""
+    rows = []
+    for name in ("accuracy", "completion"):
+        one = figures[name]
+        rows.append(
+            (
+                name,
+                f"median {_cm(one['median_m'])}, mean {_cm(one['mean_m'])}, RMSE {_cm(one['rmse_m'])} "
+                f"(distances capped at {100 * CUT_M:g} cm)",
+            )
+        )
+    rows.append(("chamfer", _cm(figures["chamfer_m"])))
+    for name, one in figures["within"].items():
+        rows.append(
+            (
+                f"within {name.replace('cm', ' cm')}",
+                f"F {fixed(one['f_score'], 3)}, precision {percent(one['precision'])}, recall "
+                f"{percent(one['recall'])}",
+            )
+        )
+    rows.append(("judged", f"{percent(figures['judged'])} of the mesh, {count(figures['points'])} points"))
+    return two_columns(title, rows)
+
+
+def _cm(distance_m: float | None) -> str:
+    return fixed(None if distance_m is None else 100 * distance_m, 2, "cm")
 
 
 def two_columns(title: str, rows: Rows) -> Table:

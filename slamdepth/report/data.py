@@ -6,7 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from slamdepth.config import Config
-from slamdepth.evaluation import DepthScore, Health, TrajectoryScore
+from slamdepth.evaluation import AlignedScores, DepthScore, Health, TrajectoryScore
+from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report.mesh_images import MeshImage
 from slamdepth.report.scale import ScaleFacts
@@ -19,6 +20,11 @@ class MeshCounts:
 
     vertices: int
     triangles: int
+
+    @classmethod
+    def of(cls, mesh: Mesh | None) -> MeshCounts | None:
+        """The size of ``mesh``; None where there is none."""
+        return None if mesh is None else cls(len(mesh.vertices_m), len(mesh.triangles))
 
 
 @dataclass(frozen=True)
@@ -53,6 +59,7 @@ class ReportData:
         weights: every weights file that took part, and the data each has seen.
         steps: one result for each frame, in order; empty where they were not kept.
         trajectory_score, depth_score, mesh: of the largest map; None where there is none.
+        surface_scores: of that mesh against what the sequence's sensor saw; None where it was not scored.
         others: the maps that never met the largest one, the largest first.
         mesh_images: views of the mesh; empty where there is none.
         skipped_frames: images that could not be read: damaged, or missing.
@@ -76,6 +83,7 @@ class ReportData:
     trajectory_score: TrajectoryScore | None = None
     depth_score: DepthScore | None = None
     mesh: MeshCounts | None = None
+    surface_scores: AlignedScores | None = None
     others: tuple[MapData, ...] = ()
     mesh_images: tuple[MeshImage, ...] = ()
     skipped_frames: int = 0

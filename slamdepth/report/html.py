@@ -7,13 +7,14 @@ from typing import Any
 
 from slamdepth.report import plots
 from slamdepth.report.axes import about_views
+from slamdepth.report.console import ALIGNMENTS
 from slamdepth.report.data import ReportData
 from slamdepth.report.keyframe_images import NEAR_TO_FAR, UNKNOWN, jpeg_address, keyframe_gallery
 from slamdepth.report.maps import MAP_HEADS, about_maps, map_rows, maps_plot
 from slamdepth.report.page import render
 from slamdepth.report.scale import scale_interval, scale_rows
 from slamdepth.report.speed import speed_caption, speed_plot, stage_times
-from slamdepth.report.text import MISSING, count, fixed
+from slamdepth.report.text import MISSING, count, fixed, percent
 
 _DEPTH_FIGURES = ("abs_rel", "rmse_m", "log_rmse", "delta1", "delta2", "delta3")
 
@@ -43,6 +44,7 @@ def build_html(data: ReportData, summary: dict[str, Any]) -> str:
         near_to_far=NEAR_TO_FAR,
         unknown=UNKNOWN,
         map_points=len(run.points_m),
+        surface_rows=_surface_rows(summary["surface"]),
         mesh_images=[
             {"title": one.title, "caption": one.caption, "address": jpeg_address(one.image_rgb)}
             for one in data.mesh_images
@@ -108,6 +110,23 @@ def _relative_rows(rpe: dict[str, Any]) -> list[list[str]]:
         span = f"{label}, {frames} poses" if frames and frames > 1 else label
         rows.append([span, fixed(rpe[key]["trans_rmse_m"], 4), fixed(rpe[key]["rot_rmse_deg"], 3)])
     return rows
+
+
+def _surface_rows(surface: dict[str, Any]) -> list[list[str]]:
+    """Figures of the mesh against the sensor's surface in each alignment; none where it was not scored."""
+    if surface["sim3"]["points"] is None:
+        return []
+    return [
+        [
+            name,
+            *(fixed(100 * surface[key][way]["median_m"], 1) for way in ("accuracy", "completion")),
+            *(fixed(100 * surface[key][way]["rmse_m"], 1) for way in ("accuracy", "completion")),
+            *(fixed(one["f_score"], 2) for one in surface[key]["within"].values()),
+            percent(surface[key]["within"]["5cm"]["precision"]),
+            percent(surface[key]["within"]["5cm"]["recall"]),
+        ]
+        for key, name in ALIGNMENTS
+    ]
 
 
 def _depth_rows(depth: dict[str, Any]) -> dict[str, list[str]]:

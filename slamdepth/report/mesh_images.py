@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,9 @@ from slamdepth.geometry import invert, project, transform
 from slamdepth.io import write_png
 from slamdepth.mapping.raycast import render_mesh
 from slamdepth.report.gaps import gap_ends
+from slamdepth.report.keyframe_images import colour_depth
 from slamdepth.report.viewpoints import from_above, guessed_gravity, ideal_camera, over_the_shoulder
+from slamdepth.typing import Floats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,11 +24,15 @@ if TYPE_CHECKING:
     from slamdepth.mapping.reconstruction import Reconstruction
     from slamdepth.types import Camera, Trajectory
 
-_WIDTH, _HEIGHT = 900, 600
-_BACKGROUND = (205, 211, 219)
+WIDTH, HEIGHT = 900, 600
+BACKGROUND = (205, 211, 219)
 _PATH, _CASING = (23, 105, 212), (255, 255, 255)
 _SUBPIXELS = 4  # bits
 _STRIPE = 8  # pixels
+
+WORST_M = 0.1
+ERROR_COLOURS = f"dark blue 0, green to yellow {100 * WORST_M:g} cm or more, grey not judged"
+"""How errors are drawn."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +68,9 @@ def render_mesh_images(mesh: Mesh, run: Reconstruction) -> tuple[MeshImage, ...]
         if run.gravity_w is not None
         else "which way is up is guessed from how the camera was held"
     )
-    wide = ideal_camera(_WIDTH, _HEIGHT, 50.0)
+    wide = ideal_camera(WIDTH, HEIGHT, 50.0)
     T = from_above(mesh, poses[:, :3, 3], gravity_w, wide)
-    whole = render_mesh(mesh, wide, T, _BACKGROUND)
+    whole = render_mesh(mesh, wide, T, BACKGROUND)
     images = [
         MeshImage(
             "The whole mesh, from above and behind the camera",
@@ -74,17 +80,49 @@ def render_mesh_images(mesh: Mesh, run: Reconstruction) -> tuple[MeshImage, ...]
             _with_path(whole, run.trajectory, wide, T),
         )
     ]
-    near = ideal_camera(_WIDTH, _HEIGHT, 65.0)
+    near = ideal_camera(WIDTH, HEIGHT, 65.0)
     if (behind := over_the_shoulder(mesh, poses, gravity_w, near)) is not None:
         images.append(
             MeshImage(
                 "Over the camera's shoulder",
                 "A step behind that place of the path from which most of the mesh is seen; to be compared "
                 "with the images.",
-                render_mesh(mesh, near, behind, _BACKGROUND),
+                render_mesh(mesh, near, behind, BACKGROUND),
             )
         )
     return tuple(images)
+
+
+def render_errors(mesh: Mesh, errors_m: Floats, run: Reconstruction) -> tuple[MeshImage, ...]:
+    """The whole mesh coloured by its distance to a reference; none where ``run`` has no pose.
+
+    Args:
+        errors_m: ``(V,)`` of each vertex, NaN where it cannot be judged.
+
+    Raises:
+        SlamdepthError: Open3D is not installed.
+    """
+    poses = run.trajectory.T_world_camera
+    if len(mesh.triangles) == 0 or len(poses) == 0:
+        return ()
+    gravity_w = guessed_gravity(poses) if run.gravity_w is None else run.gravity_w
+    wide = ideal_camera(WIDTH, HEIGHT, 50.0)
+    T = from_above(mesh, poses[:, :3, 3], gravity_w, wide)
+    colours = error_colours(errors_m).astype(np.float32) / np.float32(255.0)
+    image = render_mesh(replace(mesh, colors=colours), wide, T, BACKGROUND)
+    return (
+        MeshImage(
+            "The error of the mesh",
+            f"Distance to what the sensor saw, the trajectories aligned with scale: {ERROR_COLOURS}.",
+            image,
+        ),
+    )
+
+
+def error_colours(errors_m: Floats) -> NDArray[np.uint8]:
+    """Colours ``(V, 3)`` RGB of distances ``(V,)``, as :data:`ERROR_COLOURS` says; NaN is not judged."""
+    colours = colour_depth(errors_m[None], 0.0, WORST_M, np.isfinite(errors_m)[None])
+    return np.asarray(colours[0], np.uint8)
 
 
 def write_mesh_png(path: Path, images: tuple[MeshImage, ...]) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from slamdepth.evaluation import DepthScore
+from slamdepth.evaluation import DepthScore, surface_figures
 from slamdepth.report.data import ReportData
 from slamdepth.report.environment import hardware, versions
 from slamdepth.report.maps import first_timestamp_s, map_figures, mesh_figures, trajectory_figures
@@ -47,6 +47,7 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         **trajectory_figures(data.trajectory_score),
         "depth": _depth(data.depth_score),
         "mesh": mesh_figures(data.maps[0]),
+        "surface": surface_figures(data.surface_scores),
         "maps": maps,
         "maps_joined": statistics.maps_joined,
         "notes": [*data.notes, *run.notes],

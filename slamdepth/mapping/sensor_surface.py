@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The surface that a depth sensor saw from known poses: a reference to score meshes against."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from slamdepth.geometry import invert
+from slamdepth.mapping.fusion_depth import View, at_jumps
+from slamdepth.mapping.tsdf import ordered, undistorted_depth
+from slamdepth.open3d_loader import import_open3d
+from slamdepth.types import Camera
+from slamdepth.typing import Bools, Floats, Floats32
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_BLOCK, _BLOCKS = 8, 20_000
+_TRUNCATION = 4.0  # voxels
+_FEW = 10  # frames
+_LEAST_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class SensorFrame:
+    """One depth image of a sensor.
+
+    Attributes:
+        depth_m: ``(H, W)`` metres along z in the raw pixels of ``camera``, 0 where unknown.
+        T_world_camera: ``(4, 4)`` its true pose.
+    """
+
+    depth_m: Floats32
+    camera: Camera
+    T_world_camera: Floats
+
+
+@dataclass(frozen=True)
+class SensorSurface:
+    """What a depth sensor saw.
+
+    Attributes:
+        vertices_m, triangles: ``(V, 3)`` and ``(T, 3)``, in the world of the poses.
+        views: the depth it was made of, subsampled.
+        behind_m: how far behind what was seen a point can still be judged.
+    """
+
+    vertices_m: Floats32
+    triangles: NDArray[np.int32]
+    views: Sequence[View]
+    behind_m: float
+
+    @property
+    def cameras(self) -> Floats:
+        """Poses ``(N, 4, 4)`` of the views."""
+        return np.array([view.T_world_camera for view in self.views]).reshape(-1, 4, 4)
+
+    def can_judge(self, points: Floats) -> Bools:
+        """Mask ``(N,)`` of the world points ``(N, 3)`` about which the sensor knew something.
+
+        A point is judged if, in at least one view, it lies in front of the camera, in a pixel whose depth
+        is known and within range, and not farther than ``behind_m`` behind that depth. So a floating piece
+        in space that was seen to be empty is judged; what lies outside of every view, behind or in front of
+        an unknown pixel, or hidden behind a seen surface is not. The usual culling by frustum and occlusion
+        (Azinovic et al., "Neural RGB-D surface reconstruction", 2022; Zhu et al., "NICE-SLAM", 2022) does
+        the same with a tolerance of centimetres, which excuses walls that are too far away.
+        """
+        judged = np.zeros(len(points), bool)
+        for view in self.views:
+            open_ = np.flatnonzero(~judged)
+            z, found, known = view.seen(points[open_])
+            judged[open_] = known & (z <= found + self.behind_m)
+        return judged
+
+
+def fuse_sensor(
+    frames: Iterable[SensorFrame], voxel_m: float, max_depth_m: float, behind_m: float
+) -> SensorSurface:
+    """Fuse sensor depth at known poses into a surface (TSDF, Curless and Levoy 1996).
+
+    Pixels beyond ``max_depth_m`` or at a depth jump count as unknown. Of ten frames or more, three must
+    have seen a surface.
+
+    Args:
+        voxel_m: edge of a voxel.
+        behind_m: see :class:`SensorSurface`.
+
+    Returns:
+        The surface; without triangles where nothing was seen.
+
+    Raises:
+        SlamdepthError: Open3D is not installed.
+    """
+    o3d = import_open3d()
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), (o3d.core.float32, o3d.core.float32), ((1), (1)), voxel_m, _BLOCK, _BLOCKS,
+        o3d.core.Device("CPU:0"),
+    )  # fmt: skip
+    views: list[View] = []
+    for frame in frames:
+        unknown = (frame.depth_m > max_depth_m) | at_jumps(frame.depth_m)
+        depth = undistorted_depth(np.where(unknown, np.float32(0.0), frame.depth_m), frame.camera)
+        views.append(View.of(depth, frame.camera, frame.T_world_camera))
+        if not depth.any():
+            continue
+        image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth, np.float32)))
+        K = o3d.core.Tensor(frame.camera.K)
+        T_camera_world = o3d.core.Tensor(np.ascontiguousarray(invert(frame.T_world_camera)))
+        blocks = grid.compute_unique_block_coordinates(
+            image, K, T_camera_world, 1.0, max_depth_m, _TRUNCATION
+        )
+        grid.integrate(blocks, image, K, T_camera_world, 1.0, max_depth_m, _TRUNCATION)
+    nothing = SensorSurface(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), views, behind_m)
+    if grid.hashmap().size() == 0:
+        return nothing
+    least = _LEAST_VIEWS if len(views) >= _FEW else 1
+    mesh = grid.extract_triangle_mesh(least - 0.5)
+    if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
+        return nothing
+    positions = mesh.vertex.positions.numpy()
+    vertices, triangles, _ = ordered(positions, mesh.triangle.indices.numpy(), np.zeros_like(positions))
+    return SensorSurface(vertices, triangles, views, behind_m)
