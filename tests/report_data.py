@@ -6,10 +6,21 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from surfaces import wall
 
 from slamdepth.config import Config
 from slamdepth.depth.alignment import as_given
-from slamdepth.evaluation import DepthScorer, Health, MapFacts, RunFacts, judge_run, score_trajectory
+from slamdepth.evaluation import (
+    AlignedScores,
+    DepthScorer,
+    Health,
+    MapFacts,
+    RunFacts,
+    SurfaceScore,
+    judge_run,
+    score_surface,
+    score_trajectory,
+)
 from slamdepth.geometry import se3_exp
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
@@ -74,6 +85,11 @@ def keyframe(number: int, *, is_sensor: bool = False) -> Keyframe:
     return Keyframe(number, frame, pose, np.zeros((1, 2)), 1.0 + 0.1 * number, prediction, as_given)
 
 
+def surface_score(distance_m: float) -> SurfaceScore:
+    """The score of a wall that far from the true one."""
+    return score_surface(wall(2.0 + distance_m), wall(2.0))
+
+
 def health_of(run: Reconstruction, steps: tuple[StepResult, ...] = ()) -> Health:
     others = tuple(MapFacts(one.trajectory, one.points_m, one.statistics) for one in run.others)
     return judge_run(
@@ -125,6 +141,7 @@ def full_data() -> ReportData:
         trajectory_score=score_trajectory(truth, estimate),
         depth_score=scorer.score(),
         mesh=MeshCounts(1234, 5678),
+        surface_scores=AlignedScores(surface_score(0.1), surface_score(0.03)),
         skipped_frames=2,
         notes=("3 rows dropped",),
         options={"stride": 1, "max_frames": None},

@@ -16,8 +16,8 @@ from slamdepth.cli.console import console, print_places
 from slamdepth.io import read_tum_trajectory
 
 COMMANDS = (
-    "run", "scale", "synth", "evaluate", "depth", "data-stats", "train-depth", "eval-depth", "weights list",
-    "weights pull",
+    "run", "scale", "synth", "evaluate", "evaluate-mesh", "depth", "data-stats", "train-depth", "eval-depth",
+    "weights list", "weights pull",
 )  # fmt: skip
 
 

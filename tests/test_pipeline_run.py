@@ -42,10 +42,11 @@ def test_a_run_returns_what_it_wrote_and_prints_nothing(
     assert result.summary["depth_is_measured"] is True
     assert result.summary["settings"]["seed"] == 5
     assert (result.folder / "mesh.ply").is_file()
+    assert result.summary["surface"]["se3"]["within"]["10cm"]["f_score"] > 0.9
     stages = list(dict.fromkeys(state.stage for state in states))
     assert stages == [
         RunStage.TRACKING, RunStage.OPTIMISING, RunStage.MESHING, RunStage.DRAWING, RunStage.SCORING,
-        RunStage.REPORTING,
+        RunStage.COMPARING, RunStage.REPORTING,
     ]  # fmt: skip
     assert capfd.readouterr() == ("", "")
     assert "RunResult(" in repr(result)

@@ -77,6 +77,8 @@ def test_summary_has_the_promised_keys_and_values() -> None:
     assert (scale["keyframes"], scale["spread"], scale["sentence"]) == (6, 0.1, SCALE.sentence)
     assert [part["source"] for part in scale["parts"]] == ["network", "camera-height", "marker"]
     assert summary["mesh"] == {"vertices": 1234, "triangles": 5678}
+    assert summary["surface"]["sim3"]["accuracy"]["median_m"] == pytest.approx(0.03, abs=1e-4)
+    assert [summary["surface"][key]["within"]["5cm"]["f_score"] for key in ("se3", "sim3")] == [0.0, 1.0]
     assert summary["weights"][0] == {
         "name": "head & backbone",
         "sha256": "ab" * 32,
@@ -129,7 +131,7 @@ def leaves(value: object, prefix: str = "") -> dict[str, object]:
 
 def test_what_is_unknown_is_null_under_the_same_keys() -> None:
     full, bare = build_summary(full_data()), build_summary(bare_data())
-    for section in ("ate", "rpe", "depth", "mesh"):
+    for section in ("ate", "rpe", "depth", "mesh", "surface"):
         assert leaves(full[section]).keys() == leaves(bare[section]).keys()
         assert None not in leaves(full[section]).values()
         assert set(leaves(bare[section]).values()) == {None}
@@ -244,3 +246,17 @@ def test_a_report_names_files_without_their_folders() -> None:
     )
     settings = build_summary(replace(full_data(), config=config))["settings"]
     assert (settings["depth"]["weights"], settings["scale"]["depth"]) == ("head.st", "s.yaml")
+
+
+def test_the_mesh_is_scored_in_table_and_page_where_the_sensor_is_known() -> None:
+    data = full_data()
+    summary = build_summary(data)
+    shown = rendered(run_table(summary))
+    assert "mesh, SE(3)" in shown
+    assert "F 0.00 at 2cm, 1.00 at 5cm, 1.00 at 10cm; accuracy 3.00 cm, completion 3.00 cm (medians)" in shown
+    page = build_html(data, summary)
+    assert "The mesh against what the sensor saw" in page
+    assert "mesh, F at 5 cm" in page
+    bare = bare_data()
+    assert "mesh, SE(3)" not in rendered(run_table(build_summary(bare)))
+    assert "The mesh against what the sensor saw" not in build_html(bare, build_summary(bare))

@@ -78,16 +78,21 @@ class SensorSurface:
 
 
 def fuse_sensor(
-    frames: Iterable[SensorFrame], voxel_m: float, max_depth_m: float, behind_m: float
+    frames: Iterable[SensorFrame],
+    voxel_m: float,
+    max_depth_m: float,
+    behind_m: float,
+    *,
+    least_views: int | None = None,
 ) -> SensorSurface:
     """Fuse sensor depth at known poses into a surface (TSDF, Curless and Levoy 1996).
 
-    Pixels beyond ``max_depth_m`` or at a depth jump count as unknown. Of ten frames or more, three must
-    have seen a surface.
+    Pixels beyond ``max_depth_m`` or at a depth jump count as unknown.
 
     Args:
         voxel_m: edge of a voxel.
         behind_m: see :class:`SensorSurface`.
+        least_views: views that must have seen a surface; None: three of ten views or more, else one.
 
     Returns:
         The surface; without triangles where nothing was seen.
@@ -117,8 +122,9 @@ def fuse_sensor(
     nothing = SensorSurface(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), views, behind_m)
     if grid.hashmap().size() == 0:
         return nothing
-    least = _LEAST_VIEWS if len(views) >= _FEW else 1
-    mesh = grid.extract_triangle_mesh(least - 0.5)
+    if least_views is None:
+        least_views = _LEAST_VIEWS if len(views) >= _FEW else 1
+    mesh = grid.extract_triangle_mesh(least_views - 0.5)
     if "indices" not in mesh.triangle or len(mesh.triangle.indices) == 0:
         return nothing
     positions = mesh.vertex.positions.numpy()

@@ -233,10 +233,11 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     depth_score, depth_notes = score_depth(dataset, reconstruction.keyframes)
     surface_scores, errors_m, surface_notes = score_mesh(
         dataset,
-        job.indices,
+        job.indices[: len(tracked.steps) + tracked.skipped],
         mesh,
         trajectory_score,
         lambda done, total: tell(RunProgress(RunStage.COMPARING, done, total)),
+        is_measured=is_measured,
     )
     if mesh is not None and errors_m is not None:
         mesh_images += render_errors(mesh, errors_m, reconstruction)

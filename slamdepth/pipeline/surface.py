@@ -89,6 +89,8 @@ def score_mesh(
     mesh: Mesh | None,
     trajectory_score: TrajectoryScore | None,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    is_measured: bool = False,
 ) -> tuple[AlignedScores | None, Floats | None, tuple[str, ...]]:
     """Score a run's mesh where the sequence has sensor depth and ground truth; trouble becomes a note.
 
@@ -97,10 +99,11 @@ def score_mesh(
         mesh: in the world of the run.
         trajectory_score: of the run, whose alignments are used.
         progress: called with (frames of the reference done, frames in all).
+        is_measured: a sensor measured the run's depth, so that its scale stays as it is.
 
     Returns:
-        The scores; the distance ``(V,)`` in true metres of each vertex to what the sensor saw after the
-        alignment with scale, NaN where it cannot be judged; and notes.
+        The scores; the distance ``(V,)`` in true metres of each vertex to what the sensor saw, aligned with
+        scale unless it is measured, NaN where it cannot be judged; and notes.
     """
     if mesh is None or trajectory_score is None or not dataset.has_depth:
         return None, None, ()
@@ -110,7 +113,8 @@ def score_mesh(
     except SlamdepthError as error:
         logger.warning("the mesh is not scored: %s", error)
         return None, None, (f"the mesh is not scored: {error}",)
-    aligned = surface_of(mesh).moved(trajectory_score.sim3.T_truth_estimate)
+    alignment = trajectory_score.se3 if is_measured else trajectory_score.sim3
+    aligned = surface_of(mesh).moved(alignment.T_truth_estimate)
     return scores, vertex_errors_m(aligned, truth_of(reference), reference.can_judge), ()
 
 
