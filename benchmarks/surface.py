@@ -5,7 +5,7 @@
     python -m benchmarks.surface --only demo,kitchen --rows dense=off,sensor
 
 Every mesh is scored against the sensor's own depth, fused from the true poses, where that sensor saw
-(``slamdepth evaluate-mesh``). The trajectories are aligned with scale (Sim(3)) where depth is predicted and
+(``slamdepth evaluate-mesh``). The poses are aligned with scale (Sim(3)) where depth is predicted and
 without (SE(3)) where a sensor measured it: over a short path, the scale of an alignment is worse than a
 sensor's. F at 5 cm is given for both. "demo" is the room of ``make demo``, "bare" a room with hardly any
 texture; both have exact depth. "kitchen" and "rpy" have a Kinect's.
@@ -43,13 +43,16 @@ from benchmarks.surface_depth import scaled_predictions, score_keyframes
 from benchmarks.surface_open3d import fused_at_poses, open3d_slam
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset, open_dataset
-from slamdepth.evaluation import Surface, TrajectoryScore, score_trajectory
+from slamdepth.datasets.sequence import MAX_TIME_DIFFERENCE_S
+from slamdepth.evaluation import Surface, score_trajectory
+from slamdepth.evaluation.pose_alignment import align_by_poses
 from slamdepth.evaluation.surface_file import read_surface
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapping.sensor_surface import SensorSurface
 from slamdepth.pipeline import run
 from slamdepth.pipeline.surface import score_against, sensor_reference, surface_of
 from slamdepth.synth.sequence import SynthSettings, render_sequence
+from slamdepth.types import Trajectory
 
 SEQUENCES = ("demo", "bare", "kitchen", "rpy")
 _ROOMS: dict[str, dict[str, Any]] = {
@@ -82,14 +85,14 @@ class Made:
 
     Attributes:
         surface: None where there is none.
-        score: of the trajectory of its world.
+        trajectory: of the cameras in its world.
         keyframes: whose depth is scored too, if any.
         seconds: wall time of tracking and meshing.
         is_measured: a sensor measured the depth that the trajectory comes from.
     """
 
     surface: Surface | None
-    score: TrajectoryScore
+    trajectory: Trajectory
     keyframes: Reconstruction | None
     seconds: float
     is_measured: bool = False
@@ -111,15 +114,18 @@ class Bench:
     def row(self, name: str) -> dict[str, Any]:
         """The figures of one row."""
         made = self._makers[name]() if name in self._makers else self._ours(name.removeprefix("dense="))[0]
-        row: dict[str, Any] = {"ate_sim3_m": made.score.sim3.rmse_m, "scale": made.score.sim3.scale,
+        assert self.dataset.ground_truth is not None
+        alignment = align_by_poses(self.dataset.ground_truth, made.trajectory, MAX_TIME_DIFFERENCE_S)
+        path = score_trajectory(self.dataset.ground_truth, made.trajectory)
+        row: dict[str, Any] = {"ate_sim3_m": path.sim3.rmse_m, "scale": alignment.scale,
                                "seconds": made.seconds}  # fmt: skip
-        scores = None if made.surface is None else score_against(self.reference, made.surface, made.score)
+        scores = None if made.surface is None else score_against(self.reference, made.surface, alignment)
         row["align"] = "se3" if made.is_measured else "sim3"
         row["se3"] = None if scores is None else scores.se3.to_dict()
         row["sim3"] = None if scores is None else scores.sim3.to_dict()
         row["depth"] = None
         if made.keyframes is not None:
-            row["depth"] = score_keyframes(self.dataset, made.keyframes.keyframes, made.score.sim3.scale)
+            row["depth"] = score_keyframes(self.dataset, made.keyframes.keyframes, alignment.scale)
         return row
 
     @property
@@ -145,13 +151,8 @@ class Bench:
             seconds = time.perf_counter() - started
             file = result.folder / "mesh.ply"
             surface = read_surface(file) if file.is_file() else None
-        score = self._scored(result.reconstruction)
-        is_measured = depth == "sensor"
-        return Made(surface, score, result.reconstruction, seconds, is_measured), result.reconstruction
-
-    def _scored(self, reconstruction: Reconstruction) -> TrajectoryScore:
-        assert self.dataset.ground_truth is not None
-        return score_trajectory(self.dataset.ground_truth, reconstruction.trajectory)
+        found = result.reconstruction
+        return Made(surface, found.trajectory, found, seconds, depth == "sensor"), found
 
     def _sensor(self) -> Made:
         return replace(self._run("sensor", {})[0], keyframes=None)
@@ -162,20 +163,20 @@ class Bench:
         alone = replace(reconstruction, keyframes=scaled_predictions(reconstruction.keyframes))
         mesh = alone.fuse_mesh()
         seconds = made.seconds + time.perf_counter() - started
-        return Made(surface_of(mesh) if len(mesh.triangles) else None, made.score, alone, seconds)
+        return Made(surface_of(mesh) if len(mesh.triangles) else None, made.trajectory, alone, seconds)
 
     def _at_our_poses(self) -> Made:
         made, reconstruction = self._ours("off")
         started = time.perf_counter()
-        surface = fused_at_poses(self.dataset, reconstruction.keyframes, made.score.sim3.scale)
-        return Made(surface, made.score, None, made.seconds + time.perf_counter() - started)
+        assert self.dataset.ground_truth is not None
+        scale = align_by_poses(self.dataset.ground_truth, made.trajectory, MAX_TIME_DIFFERENCE_S).scale
+        surface = fused_at_poses(self.dataset, reconstruction.keyframes, scale)
+        return Made(surface, made.trajectory, None, made.seconds + time.perf_counter() - started)
 
     def _open3d(self) -> Made:
         started = time.perf_counter()
         surface, trajectory = open3d_slam(self.dataset)
-        seconds = time.perf_counter() - started
-        assert self.dataset.ground_truth is not None
-        return Made(surface, score_trajectory(self.dataset.ground_truth, trajectory), None, seconds, True)
+        return Made(surface, trajectory, None, time.perf_counter() - started, True)
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

@@ -35,8 +35,8 @@ def evaluate_mesh_command(
         str | None,
         typer.Option(
             metavar="none|se3|sim3",
-            help="Bring the mesh into the reference's frame by the trajectories. Default: sim3 where there "
-            "are two, else none",
+            help="Bring the mesh into the reference's frame by the poses of its run. Default: sim3 where "
+            "they are known, else none",
         ),
     ] = None,
     trajectory: Annotated[

@@ -136,7 +136,7 @@ class SurfaceScore:
 
 @dataclass(frozen=True)
 class AlignedScores:
-    """The score of one surface after alignment of the trajectories, without and with scale."""
+    """The score of one surface after alignment of the poses, without and with scale."""
 
     se3: SurfaceScore
     sim3: SurfaceScore

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from slamdepth.datasets import open_dataset
+from slamdepth.datasets.sequence import MAX_TIME_DIFFERENCE_S
 from slamdepth.errors import ConfigError, DatasetError
-from slamdepth.evaluation import Surface, SurfaceScore, score_surface, score_trajectory, vertex_errors_m
+from slamdepth.evaluation import Surface, SurfaceScore, score_surface, vertex_errors_m
+from slamdepth.evaluation.pose_alignment import align_by_poses
 from slamdepth.evaluation.surface_file import read_surface
 from slamdepth.io import read_tum_trajectory
 from slamdepth.mapping.sensor_surface import SensorSurface
@@ -79,7 +81,7 @@ class MeshEvaluation:
 
 
 def evaluate_mesh(asked: MeshQuestion, progress: Callable[[int, int], None] | None = None) -> MeshEvaluation:
-    """Score a mesh. Frames are aligned by trajectories or not at all, never by fitting the surfaces.
+    """Score a mesh; frames are aligned by the poses of its run or not at all, never by fitting surfaces.
 
     Args:
         progress: called with (frames of the reference done, frames in all).
@@ -135,8 +137,8 @@ def _against_sequence(
         if dataset.ground_truth is None:
             raise DatasetError(f"{dataset.path}: has no ground truth to align to")
         path, path_notes = read_tum_trajectory(trajectory, dataset.timestamps_s)
-        score = score_trajectory(dataset.ground_truth, path)
-        T = (score.se3 if align is Alignment.SE3 else score.sim3).T_truth_estimate
+        found = align_by_poses(dataset.ground_truth, path, MAX_TIME_DIFFERENCE_S)
+        T = found.se3 if align is Alignment.SE3 else found.sim3
         notes = [*notes, *path_notes]
     indices = RunOptions(asked.reference, max_frames=asked.max_frames).indices(len(dataset))
     seen = sensor_reference(dataset, indices, max_depth_m=asked.max_depth_m, progress=progress)

@@ -235,7 +235,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
         dataset,
         job.indices[: len(tracked.steps) + tracked.skipped],
         mesh,
-        trajectory_score,
+        reconstruction.trajectory,
         lambda done, total: tell(RunProgress(RunStage.COMPARING, done, total)),
         is_measured=is_measured,
     )

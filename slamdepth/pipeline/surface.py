@@ -13,13 +13,12 @@ from slamdepth.datasets.base import read_sound
 from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.datasets.sequence import MAX_TIME_DIFFERENCE_S
 from slamdepth.errors import DatasetError, ImageDecodeError, SlamdepthError
-from slamdepth.evaluation import TrajectoryScore
+from slamdepth.evaluation.pose_alignment import PoseAlignment, align_by_poses, poses_at
 from slamdepth.evaluation.surface import CUT_M, AlignedScores, Surface, score_surface, vertex_errors_m
-from slamdepth.geometry import invert, se3_exp, se3_log
 from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.sensor_surface import SensorFrame, SensorSurface, fuse_sensor
 from slamdepth.types import Trajectory
-from slamdepth.typing import Floats, Ints
+from slamdepth.typing import Floats
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +59,7 @@ def sensor_reference(
         raise DatasetError(f"{dataset.path}: has no ground truth, so its depth cannot be put together")
     numbers = np.asarray(range(len(dataset)) if indices is None else indices, np.int64)
     check_sensor_depth(dataset, numbers.tolist())
-    rows, poses = poses_at(dataset.ground_truth, dataset.timestamps_s[numbers])
+    rows, poses = poses_at(dataset.ground_truth, dataset.timestamps_s[numbers], MAX_TIME_DIFFERENCE_S)
     posed = numbers[rows]
     if len(posed) == 0:
         raise DatasetError(f"{dataset.path}: no image has a ground truth pose of its time")
@@ -87,7 +86,7 @@ def score_mesh(
     dataset: Dataset,
     indices: Sequence[int],
     mesh: Mesh | None,
-    trajectory_score: TrajectoryScore | None,
+    trajectory: Trajectory,
     progress: Callable[[int, int], None] | None = None,
     *,
     is_measured: bool = False,
@@ -97,7 +96,7 @@ def score_mesh(
     Args:
         indices: frames of the run.
         mesh: in the world of the run.
-        trajectory_score: of the run, whose alignments are used.
+        trajectory: of the run, by which it is aligned.
         progress: called with (frames of the reference done, frames in all).
         is_measured: a sensor measured the run's depth, so that its scale stays as it is.
 
@@ -105,30 +104,28 @@ def score_mesh(
         The scores; the distance ``(V,)`` in true metres of each vertex to what the sensor saw, aligned with
         scale unless it is measured, NaN where it cannot be judged; and notes.
     """
-    if mesh is None or trajectory_score is None or not dataset.has_depth:
+    if mesh is None or dataset.ground_truth is None or not dataset.has_depth:
         return None, None, ()
     try:
+        alignment = align_by_poses(dataset.ground_truth, trajectory, MAX_TIME_DIFFERENCE_S)
         reference = sensor_reference(dataset, indices, progress=progress)
-        scores = score_against(reference, surface_of(mesh), trajectory_score)
+        scores = score_against(reference, surface_of(mesh), alignment)
     except SlamdepthError as error:
         logger.warning("the mesh is not scored: %s", error)
         return None, None, (f"the mesh is not scored: {error}",)
-    alignment = trajectory_score.se3 if is_measured else trajectory_score.sim3
-    aligned = surface_of(mesh).moved(alignment.T_truth_estimate)
+    aligned = surface_of(mesh).moved(alignment.se3 if is_measured else alignment.sim3)
     return scores, vertex_errors_m(aligned, truth_of(reference), reference.can_judge), ()
 
 
-def score_against(
-    reference: SensorSurface, surface: Surface, trajectory_score: TrajectoryScore
-) -> AlignedScores:
-    """Score a surface of a run's world in both alignments of its trajectory.
+def score_against(reference: SensorSurface, surface: Surface, alignment: PoseAlignment) -> AlignedScores:
+    """Score a surface of a run's world, aligned without and with scale.
 
     Raises:
         DatasetError: nothing of it lies where the reference can judge.
     """
     se3, sim3 = (
-        score_surface(surface.moved(one.T_truth_estimate), truth_of(reference), reference.can_judge)
-        for one in (trajectory_score.se3, trajectory_score.sim3)
+        score_surface(surface.moved(T), truth_of(reference), reference.can_judge)
+        for T in (alignment.se3, alignment.sim3)
     )
     return AlignedScores(se3, sim3)
 
@@ -141,24 +138,3 @@ def truth_of(reference: SensorSurface) -> Surface:
 def surface_of(mesh: Mesh) -> Surface:
     """A mesh as a surface to score."""
     return Surface(mesh.vertices_m, mesh.triangles.astype(np.int64))
-
-
-def poses_at(trajectory: Trajectory, times_s: Floats) -> tuple[Ints, Floats]:
-    """Poses of a trajectory at ``times_s (N,)``, interpolated on SE(3) between the two around each time.
-
-    Returns:
-        The indices ``(K,)`` of the times that have a pose at most 0.02 s away, and ``(K, 4, 4)`` poses.
-    """
-    known_s, T = trajectory.timestamps_s, trajectory.T_world_camera
-    after = np.clip(np.searchsorted(known_s, times_s), 1, max(1, len(known_s) - 1))
-    before = after - 1
-    after = np.minimum(after, len(known_s) - 1)
-    gap = np.maximum(known_s[after] - known_s[before], 1e-9)
-    share = np.clip((times_s - known_s[before]) / gap, 0.0, 1.0)
-    near = np.minimum(np.abs(times_s - known_s[before]), np.abs(known_s[after] - times_s))
-    found = np.flatnonzero(near <= MAX_TIME_DIFFERENCE_S)
-    poses = np.empty((len(found), 4, 4))
-    for row, k in enumerate(found.tolist()):
-        motion = se3_log(invert(T[before[k]]) @ T[after[k]])
-        poses[row] = T[before[k]] @ se3_exp(share[k] * motion)
-    return found, poses

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     Rows = list[tuple[str, str]]
 
 ALIGNMENTS = (("se3", "SE(3)"), ("sim3", "Sim(3)"))
-"""Keys of the figures of a surface, and names of how the trajectories were aligned."""
+"""Keys of the figures of a surface, and names of how the poses were aligned."""
 
 
 def run_table(summary: dict[str, Any]) -> Table:

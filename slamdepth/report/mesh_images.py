@@ -113,7 +113,7 @@ def render_errors(mesh: Mesh, errors_m: Floats, run: Reconstruction) -> tuple[Me
     return (
         MeshImage(
             "The error of the mesh",
-            f"Distance to what the sensor saw, after alignment of the trajectories: {ERROR_COLOURS}.",
+            f"Distance to what the sensor saw, after alignment of the poses: {ERROR_COLOURS}.",
             image,
         ),
     )
