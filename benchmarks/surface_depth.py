@@ -5,6 +5,8 @@ Edges are occluding contours as in Depth Pro (Bochkovskii et al., 2024): between
 jumps by more than 7 %, which is the same at any scale; the nearer pixel is the edge. At 320 pixels of width
 an edge counts as found within one pixel of a true one. Precision, recall and F1 of edges are those of Hu et
 al., "Revisiting single image depth estimation" (2019). Pixels next to an unknown depth are left out.
+Unlike :func:`slamdepth.evaluation.depth_maps.edge_score`, which asks for the very pixel, this forgives the
+registration of a Kinect, and sums pixels over all keyframes.
 """
 
 from __future__ import annotations
