@@ -143,3 +143,14 @@ def test_trouble_with_the_reference_becomes_a_note(tiny_room: Path) -> None:
     assert (scores, errors_m) == (None, None)
     assert "the mesh is not scored" in notes[0]
     assert score_mesh(room, range(5), None, room.ground_truth) == (None, None, ())
+
+
+def test_depth_that_the_surface_does_not_confirm_judges_nothing() -> None:
+    """One of twelve frames sees a box that is gone in the others: too few for a surface."""
+    wall_m = np.full((120, 160), 2.0, np.float32)
+    box_m = wall_m.copy()
+    box_m[40:80, 60:100] = 1.0
+    frames = [SensorFrame(wall_m, CAMERA, np.eye(4))] * 11 + [SensorFrame(box_m, CAMERA, np.eye(4))]
+    seen = fuse_sensor(frames, 0.02, 4.0, behind_m=0.5)
+    assert (seen.views[-1].depth_m[45:75, 65:95] == 0.0).all()
+    assert (seen.views[0].depth_m[5:115, 5:155] > 0.0).all()

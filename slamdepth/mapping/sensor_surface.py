@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.geometry import invert
+from slamdepth.geometry import backproject, invert
 from slamdepth.mapping.fusion_depth import View, at_jumps
 from slamdepth.mapping.tsdf import ordered, undistorted_depth
 from slamdepth.open3d_loader import import_open3d
@@ -45,7 +45,7 @@ class SensorSurface:
 
     Attributes:
         vertices_m, triangles: ``(V, 3)`` and ``(T, 3)``, in the world of the poses.
-        views: the depth it was made of, subsampled.
+        views: the depth it was made of, subsampled; 0 also where the surface does not confirm it.
         behind_m: how far behind what was seen a point can still be judged.
     """
 
@@ -63,9 +63,9 @@ class SensorSurface:
         """Mask ``(N,)`` of the world points ``(N, 3)`` about which the sensor knew something.
 
         A point is judged if, in at least one view, it lies in front of the camera, in a pixel whose depth
-        is known and within range, and not farther than ``behind_m`` behind that depth. So a floating piece
-        in space that was seen to be empty is judged; what lies outside of every view, behind or in front of
-        an unknown pixel, or hidden behind a seen surface is not. The usual culling by frustum and occlusion
+        is known, within range and on the fused surface, and not farther than ``behind_m`` behind that depth. So
+        a floating piece in space that was seen to be empty is judged; what lies outside of every view, behind
+        or in front of an unknown pixel, or hidden behind a seen surface is not. The usual culling by frustum and occlusion
         (Azinovic et al., "Neural RGB-D surface reconstruction", 2022; Zhu et al., "NICE-SLAM", 2022) does
         the same with a tolerance of centimetres, which excuses walls that are too far away.
         """
@@ -129,4 +129,27 @@ def fuse_sensor(
         return nothing
     positions = mesh.vertex.positions.numpy()
     vertices, triangles, _ = ordered(positions, mesh.triangle.indices.numpy(), np.zeros_like(positions))
-    return SensorSurface(vertices, triangles, views, behind_m)
+    confirmed = _confirmed(views, vertices, triangles, _TRUNCATION * voxel_m)
+    return SensorSurface(vertices, triangles, confirmed, behind_m)
+
+
+def _confirmed(
+    views: Sequence[View], vertices_m: Floats32, triangles: NDArray[np.int32], within_m: float
+) -> list[View]:
+    """The views without depth that is farther than ``within_m`` from the surface, along the pixel's ray."""
+    o3d = import_open3d()
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(vertices_m), o3d.core.Tensor(triangles.astype(np.uint32)))
+    found: list[View] = []
+    for view in views:
+        known = np.flatnonzero(view.depth_m > 0)
+        v, u = np.divmod(known, view.camera.width)
+        px = np.stack([u, v], axis=1).astype(np.float64)
+        directions = backproject(view.camera, px, np.ones(len(px))) @ view.T_world_camera[:3, :3].T
+        origins = np.broadcast_to(view.T_world_camera[:3, 3], directions.shape)
+        rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
+        hit_m = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()  # of rays of unit z: depth
+        depth = view.depth_m.ravel().copy()
+        depth[known[~(np.abs(hit_m - depth[known]) <= within_m)]] = 0.0
+        found.append(replace(view, depth_m=depth.reshape(view.depth_m.shape)))
+    return found
