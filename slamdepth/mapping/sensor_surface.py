@@ -63,11 +63,12 @@ class SensorSurface:
         """Mask ``(N,)`` of the world points ``(N, 3)`` about which the sensor knew something.
 
         A point is judged if, in at least one view, it lies in front of the camera, in a pixel whose depth
-        is known, within range and on the fused surface, and not farther than ``behind_m`` behind that depth. So
-        a floating piece in space that was seen to be empty is judged; what lies outside of every view, behind
-        or in front of an unknown pixel, or hidden behind a seen surface is not. The usual culling by frustum and occlusion
-        (Azinovic et al., "Neural RGB-D surface reconstruction", 2022; Zhu et al., "NICE-SLAM", 2022) does
-        the same with a tolerance of centimetres, which excuses walls that are too far away.
+        is known, within range and on the fused surface, and not farther than ``behind_m`` behind that
+        depth. So a floating piece in space that was seen to be empty is judged; what lies outside of every
+        view, behind or in front of an unknown pixel, or hidden behind a seen surface is not. The usual
+        culling by frustum and occlusion (Azinovic et al., "Neural RGB-D surface reconstruction", 2022; Zhu
+        et al., "NICE-SLAM", 2022) does the same with a tolerance of centimetres, which excuses walls that
+        are too far away.
         """
         judged = np.zeros(len(points), bool)
         for view in self.views:
