@@ -12,8 +12,10 @@ import numpy as np
 from slamdepth.errors import DatasetError
 from slamdepth.evaluation import score_trajectory
 from slamdepth.evaluation.health_spans import GOOD_SPAN_S
+from slamdepth.evaluation.leaps import repeated_poses
 from slamdepth.io import read_tum_trajectory
 from slamdepth.types import Trajectory
+from slamdepth.typing import Floats
 
 LEAP = 15.0
 """Steps faster than so many times the median speed are leaps."""
@@ -30,12 +32,18 @@ def read_maps(folder: Path) -> list[Trajectory]:
 
 
 def count_leaps(trajectory: Trajectory) -> int:
-    """Steps whose speed is over ``LEAP`` times the median one."""
+    """Steps whose speed is over ``LEAP`` times the median one; repeated images are left out."""
     if len(trajectory) < 3:
         return 0
-    steps = np.linalg.norm(np.diff(trajectory.T_world_camera[:, :3, 3], axis=0), axis=1)
-    speeds = steps / np.diff(trajectory.timestamps_s)
+    kept = ~repeated_poses(_speeds(trajectory), np.diff(trajectory.timestamps_s))
+    speeds = _speeds(Trajectory(trajectory.timestamps_s[kept], trajectory.T_world_camera[kept]))
     return int(np.count_nonzero(speeds > LEAP * max(float(np.median(speeds)), 1e-12)))
+
+
+def _speeds(trajectory: Trajectory) -> Floats:
+    """``(N - 1,)`` of the camera's centre, a second."""
+    steps = np.linalg.norm(np.diff(trajectory.T_world_camera[:, :3, 3], axis=0), axis=1)
+    return np.asarray(steps / np.diff(trajectory.timestamps_s))
 
 
 def score_piece(truth: Trajectory, estimate: Trajectory, *, is_metric: bool) -> dict[str, Any]:

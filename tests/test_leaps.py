@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slamdepth.evaluation.leaps import confirmed, find_leaps, unconfirmed_poses
+from slamdepth.evaluation.leaps import confirmed, find_leaps, repeated_poses, unconfirmed_poses
 from slamdepth.geometry import se3_exp
 from slamdepth.types import Trajectory
 from slamdepth.typing import Floats
@@ -50,6 +50,29 @@ def test_a_steady_path_is_confirmed() -> None:
 def test_a_piece_of_less_than_a_second_between_two_leaps_is_not(end: int) -> None:
     trajectory = at(moved(100, end))
     assert unconfirmed(trajectory) == list(range(100, end))
+
+
+@pytest.mark.parametrize("times", [12.0, 20.0])
+def test_the_step_after_a_repeated_image_is_no_leap(times: float) -> None:
+    """A quick turn while an image is repeated: the next step has the motion of both."""
+    steps = np.full(COUNT, 0.004)
+    steps[100:103] = 0.0, times * 0.004, 0.5 * times * 0.004
+    turned = np.zeros((COUNT, 6))
+    turned[:, 4] = np.cumsum(steps)
+    assert find_leaps(at(se3_exp(turned)), SCENE_M).tolist() == []
+
+
+def test_a_leap_after_a_repeated_image_is_found() -> None:
+    poses = moved(100, COUNT)
+    poses[99] = poses[98]
+    assert find_leaps(at(poses), SCENE_M).tolist() == [99]
+
+
+def test_of_poses_that_all_repeat_one_another_every_second_one_counts() -> None:
+    speed = np.ones(41)
+    speed[10:21] = 0.0
+    found = repeated_poses(speed, np.full(41, 1.0 / FPS))
+    assert np.flatnonzero(found).tolist() == [11, 13, 15, 17, 19, 21]
 
 
 def test_two_long_pieces_with_a_leap_between_them_are_kept() -> None:

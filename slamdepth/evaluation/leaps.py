@@ -68,16 +68,52 @@ def find_leaps(trajectory: Trajectory, distance: float | None, quality: Floats |
       a camera has mass, so a real quick turn takes several frames.
 
     Steps over more than 0.25 s (footage at a few frames a second, gaps of lost frames) are not judged, nor
-    are steps without a judged neighbour. A cut in the recording looks the same as a leap.
+    are steps without a judged neighbour. A pose that repeats the one before (:func:`repeated_poses`) is left
+    out: the step over it has the motion of both intervals. A cut in the recording looks the same as a leap.
 
     Args:
         distance: of the scene, see :func:`scene_distance`; None compares rotations only.
         quality: ``(N,)`` of the poses, see :class:`slamdepth.StepResult`: a step to or from a pose that its
             own matches hardly determine confirms nothing. None: all do.
     """
-    judged = judged_steps(trajectory)
-    if not judged.any():
+    if not judged_steps(trajectory).any():
         return np.zeros(0, dtype=np.int64)
+    speed = np.linalg.norm(_image_velocity(trajectory, distance), axis=1)
+    kept = np.flatnonzero(~repeated_poses(speed, np.diff(trajectory.timestamps_s)))
+    moving = Trajectory(trajectory.timestamps_s[kept], trajectory.T_world_camera[kept])
+    found = _leaps(moving, distance, None if quality is None else quality[kept])
+    return np.asarray(kept[found + 1] - 1)
+
+
+def repeated_poses(speed: Floats, duration_s: Floats) -> Bools:
+    """Poses that repeat the one before, as webcams and converters repeat an image that comes too late.
+
+    Such a pose has no motion of its own, and the step after it has that of two intervals: together they are
+    one step. Never two in a row, for a camera that stands still repeats its pose, too.
+
+    Args:
+        speed: ``(N - 1,)`` of the steps, in any unit.
+        duration_s: ``(N - 1,)`` of them.
+
+    Returns:
+        ``(N,)``, True for pose ``n + 1`` where step ``n`` is slower than a fifteenth of the median, and takes
+        at most 0.25 s together with the next one.
+    """
+    repeated = np.zeros(len(speed) + 1, dtype=np.bool_)
+    judged = duration_s <= MAX_STEP_S
+    if not judged.any():
+        return repeated
+    rests = speed * _FASTER < np.median(speed[judged])
+    rests[:-1] &= duration_s[:-1] + duration_s[1:] <= MAX_STEP_S
+    rests[-1] = False
+    for n in np.flatnonzero(rests):
+        repeated[n + 1] = not repeated[n]
+    return repeated
+
+
+def _leaps(trajectory: Trajectory, distance: float | None, quality: Floats | None) -> Ints:
+    """See :func:`find_leaps`; no pose repeats another."""
+    judged = judged_steps(trajectory)
     velocity = _image_velocity(trajectory, distance)
     duration_s = np.diff(trajectory.timestamps_s)
     speed = np.linalg.norm(velocity, axis=1)
