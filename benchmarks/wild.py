@@ -159,6 +159,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="a further sequence with ground truth, such as a rendered room; can be repeated")  # fmt: skip
     add("--single-start", action="store_true", help="from frame 0 only")
     add("--loops", choices=("on", "off"), default="on", help="close loops (default: on)")
+    add("--single-map", action="store_true", help="start no new map where the camera stays lost")
     add("--depth", default="dinov2", metavar="NAME", help="depth model (default: dinov2)")
     add("--work", type=Path, metavar="DIR", help="keep the run folders here (default: temporary)")
     add("--output", "-o", type=Path, metavar="FILE", help="write the figures as JSON")
@@ -169,10 +170,17 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     asked, begun = parse(arguments), environment()
-    config = Config.from_dict({"depth": {"name": asked.depth}, "loops": {"enabled": asked.loops == "on"}})
+    config = Config.from_dict(
+        {
+            "depth": {"name": asked.depth},
+            "loops": {"enabled": asked.loops == "on"},
+            "tracking": {"new_maps": not asked.single_map},
+        }
+    )
+    about = {"depth": asked.depth, "loops": asked.loops, "single_map": asked.single_map}
     recordings = find_recordings(asked.data, asked.also, asked.only)
     starts = STARTS[:1] if asked.single_start else STARTS
-    file = RowFile(asked.output, begun, {"depth": asked.depth, "loops": asked.loops}, _KEYS)
+    file = RowFile(asked.output, begun, about, _KEYS)
     wanted = [(recording, start) for recording in recordings for start in starts]
     rows = []
     with tempfile.TemporaryDirectory(prefix="wild-") as temporary, _bar() as bar:
