@@ -105,6 +105,17 @@ def test_a_short_piece_between_a_leap_and_a_gap_is_not() -> None:
     assert unconfirmed(at(moved(100, 110), kept)) == list(range(100, 110))
 
 
+def test_a_good_short_piece_after_a_leap_is_kept_only_where_no_motion_led_there() -> None:
+    """After a cut in the recording nothing leads to the first pose; a tracker that slips was led there."""
+    trajectory, good = at(moved(190, COUNT)), np.ones(COUNT)
+    led = np.ones(COUNT, dtype=bool)
+    assert np.flatnonzero(unconfirmed_poses(trajectory, SCENE_M, good, led)).tolist() == list(
+        range(190, COUNT)
+    )
+    led[190] = False
+    assert not unconfirmed_poses(trajectory, SCENE_M, good, led).any()
+
+
 def test_a_short_piece_between_two_gaps_is_kept_without_a_leap() -> None:
     kept = np.r_[0:60, 80:90, 110:COUNT]
     assert unconfirmed(at(walk(), kept)) == []

@@ -126,20 +126,26 @@ def _leaps(trajectory: Trajectory, distance: float | None, quality: Floats | Non
     return candidates[[_is_contradicted(velocity, judged, confirms, int(n)) for n in candidates]]
 
 
-def unconfirmed_poses(trajectory: Trajectory, distance: float | None, quality: Floats | None = None) -> Bools:
+def unconfirmed_poses(
+    trajectory: Trajectory,
+    distance: float | None,
+    quality: Floats | None = None,
+    led: Bools | None = None,
+) -> Bools:
     """Poses of short pieces that only leaps join to the rest, or that stand alone: no motion confirms them.
 
     One or two poses stand alone where a gap of over 0.25 s and three usual steps, or an end of the
     trajectory, is before and behind them. Leaps (:func:`find_leaps`) and gaps of over 0.25 s cut a trajectory
     into pieces. A piece of less than a second that begins or ends with a leap is unconfirmed: a single pose
     that leaps there and back, or the first poses of a map before it found itself. One between a leap and a
-    gap is kept where most of its poses are good by themselves: after a cut. The search is repeated without
-    them, as they hid what the motion around them is. The longest piece is always kept, and so is everything
-    of a trajectory without leaps and gaps.
+    gap is kept where most of its poses are good by themselves and no motion led over the leap: after a cut.
+    The search is repeated without them, as they hid what the motion around them is. The longest piece is
+    always kept, and so is everything of a trajectory without leaps and gaps.
 
     Args:
         distance: of the scene, see :func:`scene_distance`; None compares rotations only.
         quality: ``(N,)`` of the poses, see :func:`find_leaps`.
+        led: ``(N,)``, whether a pose was looked for where the motion before led. None: none was.
 
     Returns:
         ``(N,)``, True where a pose is unconfirmed.
@@ -148,7 +154,9 @@ def unconfirmed_poses(trajectory: Trajectory, distance: float | None, quality: F
     while len(kept) > 1:
         rest = Trajectory(trajectory.timestamps_s[kept], trajectory.T_world_camera[kept])
         sure = None if quality is None else quality[kept]
-        short = _short_pieces(rest, find_leaps(rest, distance, sure), sure)
+        leaps = find_leaps(rest, distance, sure)
+        was_led = np.zeros(len(kept), dtype=np.bool_) if led is None else led[kept]
+        short = _short_pieces(rest, leaps, sure, was_led)
         if not short.any():
             break
         kept = kept[~short]
@@ -157,14 +165,16 @@ def unconfirmed_poses(trajectory: Trajectory, distance: float | None, quality: F
     return unconfirmed
 
 
-def confirmed(trajectory: Trajectory, points_w: Floats, quality: Floats | None = None) -> Trajectory:
+def confirmed(
+    trajectory: Trajectory, points_w: Floats, quality: Floats | None = None, led: Bools | None = None
+) -> Trajectory:
     """The trajectory without its :func:`unconfirmed_poses`; itself where there are none.
 
     Args:
         points_w: ``(P, 3)`` map points, world frame.
-        quality: ``(N,)`` of the poses, see :func:`find_leaps`.
+        quality, led: ``(N,)`` of the poses, see :func:`unconfirmed_poses`.
     """
-    drop = unconfirmed_poses(trajectory, scene_distance(trajectory, points_w), quality)
+    drop = unconfirmed_poses(trajectory, scene_distance(trajectory, points_w), quality, led)
     if not drop.any():
         return trajectory
     return replace(
@@ -174,11 +184,11 @@ def confirmed(trajectory: Trajectory, points_w: Floats, quality: Floats | None =
     )
 
 
-def _short_pieces(trajectory: Trajectory, leaps: Ints, quality: Floats | None) -> Bools:
+def _short_pieces(trajectory: Trajectory, leaps: Ints, quality: Floats | None, led: Bools) -> Bools:
     """``(N,)`` whether a pose is in a piece of less than a second with a leap at an end, or stands alone.
 
-    The longest piece is in none, nor is one between a leap and a gap whose poses are good by themselves, as
-    after a cut.
+    The longest piece is in none, nor is one between a leap that no motion led over and a gap whose poses are
+    good by themselves, as after a cut.
     """
     is_leap = np.zeros(len(trajectory) + 1, dtype=bool)  # at n: between poses n - 1 and n
     is_leap[leaps + 1] = True
@@ -195,7 +205,10 @@ def _short_pieces(trajectory: Trajectory, leaps: Ints, quality: Floats | None) -
     longest = np.argmax(lasts_s)
     if quality is not None:
         is_good = [float(np.median(quality[a:b])) >= _GOOD for a, b in zip(first, end, strict=True)]
-        is_short &= (is_leap[first] & is_leap[end]) | ~np.array(is_good)
+        is_led = np.zeros_like(is_leap)
+        is_led[leaps + 1] = led[leaps + 1]
+        after_cut = np.array(is_good) & ~(is_leap[first] & is_leap[end]) & ~(is_led[first] | is_led[end])
+        is_short &= ~after_cut
     is_short |= (end - first < _FEWEST_IN_MOTION) & is_gap[first] & is_gap[end]
     is_short[longest] = False
     return np.repeat(is_short, end - first)

@@ -106,7 +106,7 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
         keyframes = tuple(replace(made.result(), id=n) for n, made in enumerate(making))
     points_m = map_.landmarks.position_w[seen]
     found = frames.trajectory()
-    trajectory = confirmed(found, points_m, frames.quality)
+    trajectory = confirmed(found, points_m, frames.quality, frames.follows_motion)
     kept_s = set(trajectory.timestamps_s.tolist())
     withdrawn = frames.withdrawn + len(found) - len(trajectory)
     statistics = replace(statistics, tracked=len(trajectory), withdrawn=withdrawn)

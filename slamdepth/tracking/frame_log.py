@@ -18,7 +18,7 @@ from slamdepth.mapping.map import Map
 from slamdepth.mapping.map_keyframe import AnchoredPose
 from slamdepth.mapping.placement import Placement
 from slamdepth.types import Camera, Frame, Trajectory
-from slamdepth.typing import Floats, Floats32, Ints
+from slamdepth.typing import Bools, Floats, Floats32, Ints
 
 _MIN_MATCHES = 30
 _MAX_GAP_S = 0.2  # frames farther apart say little of the velocity between them
@@ -292,6 +292,11 @@ class FrameLog:
     def quality(self) -> Floats:
         """Of each placed frame's pose when it was placed, ``(N,)``."""
         return np.array([p.quality for p in self._placed])
+
+    @property
+    def follows_motion(self) -> Bools:
+        """Whether a motion led to each placed frame from the one before, ``(N,)``."""
+        return np.array([p.follows_motion for p in self._placed], dtype=np.bool_)
 
     def trajectory(self) -> Trajectory:
         """All placed frames in the world frame."""
