@@ -237,6 +237,15 @@ class MapConfig(_Section):
     )
 
 
+class DenseConfig(_Section):
+    """Dense depth of keyframes from many views, at the end of a run."""
+
+    mode: Literal["off", "fast", "best"] = Field(
+        "fast",
+        description="'off' keeps the depth model's relief; 'best' looks twice, with more views; slower",
+    )
+
+
 class Config(_Section):
     """Every setting of a run."""
 
@@ -250,6 +259,7 @@ class Config(_Section):
     loops: LoopConfig = LoopConfig()
     depth: DepthConfig = DepthConfig()
     scale: ScaleConfig = ScaleConfig()
+    dense: DenseConfig = DenseConfig()
     map: MapConfig = MapConfig()
 
     @model_validator(mode="after")

@@ -119,6 +119,14 @@ def run_command(
     ] = None,
     max_frames: MaxFramesOption = None,
     stride: StrideOption = 1,
+    dense: Annotated[
+        str | None,
+        typer.Option(
+            metavar="off|fast|best",
+            help="Depth of the keyframes from many views, for the mesh: half a second a keyframe, or two. "
+            "Default: fast",
+        ),
+    ] = None,
     no_mesh: Annotated[bool, typer.Option("--no-mesh", help="Make no mesh.")] = False,
     voxel_size: Annotated[
         float | None, typer.Option(metavar="M", help="Edge of the mesh's voxels in metres. Default: 0.02")
@@ -167,6 +175,7 @@ def run_command(
             },
             "tracking": {"new_maps": False if single_map else None},
             "shutter": {"readout_ms": readout_ms},
+            "dense": {"mode": dense},
             "map": {"voxel_size_m": voxel_size},
         },
     )

@@ -23,7 +23,8 @@ class Agreement:
     Attributes:
         agree: ``(h, w)`` number of keyframes that see the same surface to 2 %.
         seen: ``(h, w)`` number of keyframes that have any depth there.
-        mean_log: ``(h, w)`` mean log ratio of the surface to this depth, over this keyframe and those that agree.
+        mean_log: ``(h, w)`` mean log ratio of the surface to this depth, over this keyframe and
+            those that agree.
     """
 
     agree: Floats32
@@ -49,13 +50,14 @@ def agreement(
     """
     height, width = depth_m.shape
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    rays = ((u - np.float32(camera.cx)) / np.float32(camera.fx), (v - np.float32(camera.cy)) / np.float32(camera.fy))
+    rays = (
+        (u - np.float32(camera.cx)) / np.float32(camera.fx),
+        (v - np.float32(camera.cy)) / np.float32(camera.fy),
+    )
     agree, seen, total = (np.zeros(depth_m.shape, np.float32) for _ in range(3))
     for other_m, T_world_other in others:
         T = (invert(T_world_other) @ T_world_camera).astype(np.float32)
-        x, y, z = (
-            (T[i, 0] * rays[0] + T[i, 1] * rays[1] + T[i, 2]) * depth_m + T[i, 3] for i in range(3)
-        )
+        x, y, z = ((T[i, 0] * rays[0] + T[i, 1] * rays[1] + T[i, 2]) * depth_m + T[i, 3] for i in range(3))
         ahead = np.maximum(z, np.float32(1e-3))
         column = np.rint(np.clip(x / ahead * camera.fx + camera.cx, -1, width)).astype(np.int64)
         row = np.rint(np.clip(y / ahead * camera.fy + camera.cy, -1, height)).astype(np.int64)

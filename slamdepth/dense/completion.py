@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from slamdepth.typing import Bytes, Floats32
@@ -13,12 +15,12 @@ _COARSEST_PX = 24
 _STEPS = 40
 
 
-def spread(values: Floats32, weight: Floats32, grey: Bytes, range_px: float) -> tuple[Floats32, Floats32]:
+def spread(values: Floats32, weight: Floats32, grey: Bytes, range_px: float) -> Floats32:
     """Fill an image from weighted values, smoothly but for edges of the image.
 
-    Minimises ``sum weight (x - value)^2 + sum tie (x_i - x_j)^2 + sum (x / range_px)^2`` over neighbours i and
-    j (weighted least squares, Farbman et al., SIGGRAPH 2008), by conjugate gradients from coarse to fine. Far
-    from any value, in units of ``range_px``, the result goes to zero.
+    Minimises ``sum weight (x - value)^2 + sum tie (x_i - x_j)^2 + sum (x / range_px)^2`` over neighbours i
+    and j (weighted least squares, Farbman et al., SIGGRAPH 2008), by conjugate gradients from coarse to
+    fine. Far from any value, in units of ``range_px``, the result goes to zero.
 
     Args:
         values: ``(h, w)``, finite.
@@ -27,12 +29,10 @@ def spread(values: Floats32, weight: Floats32, grey: Bytes, range_px: float) -> 
         range_px: how far a value reaches over an even image.
 
     Returns:
-        ``(x (h, w), share (h, w))``: the second is the same of values of one, so the share of the result
-        that values account for, 0 to 1.
+        ``(h, w)``.
     """
-    both = np.stack([values * weight, weight]).astype(np.float32)
-    x = _solved(both, weight.astype(np.float32), grey.astype(np.float32), float(range_px))
-    return x[0], np.clip(x[1], 0.0, 1.0)
+    right = (values * weight).astype(np.float32)
+    return _solved(right, weight.astype(np.float32), grey.astype(np.float32), range_px)
 
 
 def _solved(right: Floats32, weight: Floats32, grey: Floats32, range_px: float) -> Floats32:
@@ -47,11 +47,8 @@ def _solved(right: Floats32, weight: Floats32, grey: Floats32, range_px: float) 
             return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
         # a coarse pixel stands for four: its data count four times as much, its ties as before
-        coarse = _solved(
-            4.0 * np.stack([half(one) for one in right]), 4.0 * half(weight), half(grey), range_px / 2
-        )
-        for n, one in enumerate(coarse):
-            start[n] = cv2.resize(one, (width, height), interpolation=cv2.INTER_LINEAR)
+        coarse = _solved(4.0 * half(right), 4.0 * half(weight), half(grey), range_px / 2)
+        start = np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
     across = _ties(np.abs(np.diff(grey, axis=1)))
     down = _ties(np.abs(np.diff(grey, axis=0)))
     own = weight + np.float32(range_px**-2)
@@ -63,12 +60,12 @@ def _solved(right: Floats32, weight: Floats32, grey: Floats32, range_px: float) 
 
     def product(x: Floats32) -> Floats32:
         result = own * x
-        step = across * (x[:, :, :-1] - x[:, :, 1:])
-        result[:, :, :-1] += step
-        result[:, :, 1:] -= step
-        step = down * (x[:, :-1] - x[:, 1:])
+        step = across * (x[:, :-1] - x[:, 1:])
         result[:, :-1] += step
         result[:, 1:] -= step
+        step = down * (x[:-1] - x[1:])
+        result[:-1] += step
+        result[1:] -= step
         return np.asarray(result, np.float32)
 
     return _conjugate_gradients(product, diagonal, right, start)
@@ -78,23 +75,27 @@ def _ties(step: Floats32) -> Floats32:
     return np.asarray(np.exp(-step / _EDGE_GREY) + _LEAST_TIE, np.float32)
 
 
-def _conjugate_gradients(product, diagonal: Floats32, right: Floats32, x: Floats32) -> Floats32:  # type: ignore[no-untyped-def]
-    """Preconditioned by the diagonal; two right-hand sides at a time."""
+def _conjugate_gradients(
+    product: Callable[[Floats32], Floats32], diagonal: Floats32, right: Floats32, x: Floats32
+) -> Floats32:
+    """Some steps from ``x`` to where ``product(x)`` is ``right``, preconditioned by the diagonal."""
     residual = right - product(x)
     z = residual / diagonal
     direction = z.copy()
     old = _dot(residual, z)
     for _ in range(_STEPS):
+        if old <= 0.0:
+            break
         image = product(direction)
-        step = old / np.maximum(_dot(direction, image), 1e-20)
+        step = np.float32(old / max(_dot(direction, image), 1e-30))
         x = x + step * direction
         residual = residual - step * image
         z = residual / diagonal
         new = _dot(residual, z)
-        direction = z + (new / np.maximum(old, 1e-20)) * direction
+        direction = z + np.float32(new / old) * direction
         old = new
     return x
 
 
-def _dot(a: Floats32, b: Floats32) -> Floats32:
-    return np.asarray(np.einsum("nij,nij->n", a, b, dtype=np.float64)[:, None, None], np.float32)
+def _dot(a: Floats32, b: Floats32) -> float:
+    return float(np.einsum("ij,ij->", a, b, dtype=np.float64))

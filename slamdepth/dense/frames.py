@@ -14,7 +14,7 @@ from slamdepth.dense.sweep import View
 from slamdepth.errors import ImageDecodeError
 from slamdepth.frontend.rolling_shutter import velocity_between
 from slamdepth.geometry import invert
-from slamdepth.typing import Floats, Bytes
+from slamdepth.typing import Bytes, Floats
 
 log = logging.getLogger(__name__)
 

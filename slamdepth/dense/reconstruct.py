@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,15 +19,18 @@ from slamdepth.dense.measure import measure
 from slamdepth.dense.rectify import Rectifier
 from slamdepth.dense.sheet import first_sheet
 from slamdepth.dense.sweep import View
-from slamdepth.dense.views import choose_views, seen_share, surface_points
+from slamdepth.dense.views import are_seen, choose_views, surface_points
 from slamdepth.mapping.codec import encode_half_precision
+from slamdepth.mapping.dense_depth import DenseDepth, StoredDenseDepth
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapping.spill_file import SpilledArray, SpillFile
-from slamdepth.mapping.surface import StoredSurface, Surface
 from slamdepth.thread_limits import single_threaded
 from slamdepth.types import Camera
 from slamdepth.typing import Bytes, Floats, Floats32
+
+_S = TypeVar("_S")
+_T = TypeVar("_T")
 
 _BATCH = 48  # keyframes whose views are in memory at a time
 _NEIGHBOURS = 8
@@ -66,22 +70,22 @@ def densify(
     Args:
         reconstruction: a finished map, with keyframes' depth by a network or a sensor.
         frames: all placed frames, in order of time; those of the keyframes are among them.
-        read: gives the ``(H, W, 3)`` uint8 image of a frame that is no keyframe; an ``ImageDecodeError`` leaves
-            it out.
+        read: gives the ``(H, W, 3)`` uint8 image of a frame that is no keyframe; an ``ImageDecodeError``
+            leaves it out.
         effort: see :data:`EFFORTS`.
         progress: called with (steps done, steps in all).
 
     Returns:
-        The same map; each keyframe with depth has a ``surface``. The same input gives the same bytes.
+        The same map; each keyframe with depth has ``dense`` depth. The same input gives the same bytes.
     """
     if len(reconstruction.keyframes) < 2:
         return reconstruction
     job = _Job(reconstruction, frames, read, effort, progress or (lambda done, total: None))
     with single_threaded(), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        surfaces = job.run(pool)
+        depths = job.run(pool)
     return replace(
         reconstruction,
-        keyframes=tuple(replace(kf, surface=surfaces.get(kf.id)) for kf in reconstruction.keyframes),
+        keyframes=tuple(replace(kf, dense=depths.get(kf.id)) for kf in reconstruction.keyframes),
     )
 
 
@@ -122,40 +126,37 @@ class _Job:
         self._progress = progress
         self._done, self._total = 0, len(keyframes) * (1 + 2 * len(effort.rounds))
 
-    def run(self, pool: ThreadPoolExecutor) -> dict[int, StoredSurface]:
+    def run(self, pool: ThreadPoolExecutor) -> dict[int, StoredDenseDepth]:
         states = [state for state in self._each(pool, self._begin, self._keyframes) if state is not None]
         neighbours = _neighbours(states, self._camera)
-        surfaces: dict[int, StoredSurface] = {}
-        last = len(self._effort.rounds) - 1
-        for number, (reach_log, labels) in enumerate(self._effort.rounds):
-            for start in range(0, len(states), _BATCH):
-                batch = states[start : start + _BATCH]
-                chosen = [self._chosen(state) for state in batch]
-                self._views.load(
-                    index
-                    for state, views in zip(batch, chosen, strict=True)
-                    for index in (state.keyframe.frame.index, *views)
-                )
-                work = list(zip(batch, chosen, strict=True))
-                list(self._each(pool, lambda one: self._measure(*one, reach_log, labels), work))
-            for state, surface in zip(
-                states,
-                self._each(
-                    pool,
-                    lambda state: self._settle(state, [states[n] for n in neighbours[state.keyframe.id]]),
-                    states,
-                ),
-                strict=True,
-            ):
-                if number == last:
-                    surfaces[state.keyframe.id] = surface
-        return surfaces
+        depths: list[StoredDenseDepth] = []
+        for reach_log, labels in self._effort.rounds:
+            self._search(pool, states, reach_log, labels)
+            settle = partial(self._settle, states=states, neighbours=neighbours)
+            depths = self._each(pool, settle, range(len(states)))
+        return {state.keyframe.id: one for state, one in zip(states, depths, strict=True)}
 
-    def _each(self, pool: ThreadPoolExecutor, function: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[Any]:
+    def _search(
+        self, pool: ThreadPoolExecutor, states: Sequence[_State], reach_log: float, labels: int
+    ) -> None:
+        """Depth by the views of all keyframes, a batch at a time: their images have to be in memory."""
+        for start in range(0, len(states), _BATCH):
+            batch = states[start : start + _BATCH]
+            chosen = {state.keyframe.id: self._chosen(state) for state in batch}
+            self._views.load(
+                index for state in batch for index in (state.keyframe.frame.index, *chosen[state.keyframe.id])
+            )
+            measure_one = partial(self._measure, chosen=chosen, reach_log=reach_log, labels=labels)
+            self._each(pool, measure_one, batch)
+
+    def _each(self, pool: ThreadPoolExecutor, function: Callable[[_S], _T], items: Iterable[_S]) -> list[_T]:
+        """The results for all items, in order."""
+        results = []
         for result in pool.map(function, items):
             self._done += 1
             self._progress(self._done, self._total)
-            yield result
+            results.append(result)
+        return results
 
     def _put(self, state: _State, **maps: Floats32) -> None:
         for name, values in maps.items():
@@ -185,10 +186,10 @@ class _Job:
         )
         return [self._frames[row].index for row in rows]
 
-    def _measure(self, state: _State, chosen: Sequence[int], reach_log: float, labels: int) -> None:
+    def _measure(self, state: _State, chosen: dict[int, list[int]], reach_log: float, labels: int) -> None:
         """Depth by the views, about the present one."""
         present = state.maps["present"].load()
-        views = [view for index in chosen if (view := self._views.get(index)) is not None]
+        views = [view for index in chosen[state.keyframe.id] if (view := self._views.get(index)) is not None]
         if len(views) < 2:
             self._put(state, found=present, evidence=np.zeros_like(present))
             return
@@ -197,9 +198,12 @@ class _Job:
         measured = measure(keyframe, present, views, self._camera, reach_log, labels)
         self._put(state, found=present * np.exp(measured.log_ratio), evidence=measured.evidence)
 
-    def _settle(self, state: _State, others: Sequence[_State]) -> StoredSurface:
+    def _settle(
+        self, place: int, states: Sequence[_State], neighbours: Sequence[Sequence[int]]
+    ) -> StoredDenseDepth:
         """Keep what other keyframes confirm, and complete it by the sheet."""
-        keyframe = state.keyframe
+        state = states[place]
+        keyframe, others = state.keyframe, [states[n] for n in neighbours[place]]
         found, evidence, sheet, signed = (
             state.maps[name].load() for name in ("found", "evidence", "sheet", "sigma")
         )
@@ -213,8 +217,8 @@ class _Job:
         fused = fuse(sheet, np.abs(signed), signed < 0, found, evidence, agreed, view.grey)
         self._put(state, present=fused.complete_m)
         image_rgb = self._rectifier.color(keyframe.frame.load().image_rgb, positions)
-        surface = Surface(self._camera, image_rgb, fused.depth_m, fused.sigma_log, fused.is_measured)
-        return StoredSurface.of(surface, self._file)
+        depth = DenseDepth(self._camera, image_rgb, fused.depth_m, fused.sigma_log, fused.is_measured)
+        return StoredDenseDepth.of(depth, self._file)
 
 
 def _inverse_depth(keyframes: Sequence[Keyframe]) -> float:
@@ -224,13 +228,13 @@ def _inverse_depth(keyframes: Sequence[Keyframe]) -> float:
     return 1.0 / float(np.median(np.concatenate(depths))) if depths else 0.0
 
 
-def _neighbours(states: Sequence[_State], camera: Camera) -> dict[int, list[int]]:
-    """By keyframe id, the places of those that see most of the same."""
+def _neighbours(states: Sequence[_State], camera: Camera) -> list[list[int]]:
+    """For each keyframe the places of those that see most of the same."""
     poses = np.array([state.keyframe.T_world_camera for state in states])
-    found: dict[int, list[int]] = {}
+    found = []
     for place, state in enumerate(states):
-        share = seen_share(state.points_w, camera, poses)[0].mean(axis=1) if len(state.points_w) else poses[:, 0, 0] * 0
+        share = are_seen(state.points_w, camera, poses).mean(axis=1)
         share[place] = 0.0
         best = np.argsort(-share, kind="stable")[:_NEIGHBOURS]
-        found[state.keyframe.id] = [int(n) for n in best if share[n] > _LEAST_OVERLAP]
+        found.append([int(n) for n in best if share[n] > _LEAST_OVERLAP])
     return found

@@ -80,7 +80,7 @@ class Rectifier:
         grey = np.maximum(cv2.cvtColor(self.small(image_rgb), cv2.COLOR_RGB2GRAY), 1)
         if positions is None:
             return np.asarray(grey, np.uint8)
-        return np.asarray(cv2.remap(grey, positions, None, cv2.INTER_LINEAR, borderValue=0), np.uint8)
+        return np.asarray(cv2.remap(grey, *_split(positions), cv2.INTER_LINEAR, borderValue=0), np.uint8)
 
     def color(self, image_rgb: Bytes, positions: Floats32 | None) -> Bytes:
         """Rectified colours ``(h, w, 3)`` uint8."""
@@ -89,7 +89,7 @@ class Rectifier:
         small = self.small(image_rgb)
         if positions is None:
             return small
-        image = cv2.remap(small, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        image = cv2.remap(small, *_split(positions), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(image, np.uint8)
 
     def nearest(self, values: Floats32, positions: Floats32 | None) -> Floats32:
@@ -101,7 +101,11 @@ class Rectifier:
             u, v = np.meshgrid(np.arange(self.raw.width), np.arange(self.raw.height))
             positions = np.stack([u, v], axis=2).astype(np.float32)
         full = (positions + np.float32(0.5)) * np.array([sx, sy], np.float32) - np.float32(0.5)
-        return np.asarray(cv2.remap(values, full, None, cv2.INTER_NEAREST, borderValue=0), np.float32)
+        return np.asarray(cv2.remap(values, *_split(full), cv2.INTER_NEAREST, borderValue=0), np.float32)
+
+
+def _split(positions: Floats32) -> tuple[Floats32, Floats32]:
+    return np.ascontiguousarray(positions[..., 0]), np.ascontiguousarray(positions[..., 1])
 
 
 def _distorted(camera: Camera, px: Floats) -> Floats:

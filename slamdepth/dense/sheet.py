@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamdepth.dense.completion import spread
+from slamdepth.dense.rectify import Rectifier
 from slamdepth.depth.alignment import DEFAULT_SIGMA_LOG
 from slamdepth.mapping.keyframe import Keyframe
-from slamdepth.dense.rectify import Rectifier
 from slamdepth.typing import Bools, Bytes, Floats32
 
 _LEAST_KNOWN = 0.05
@@ -34,8 +34,10 @@ class Sheet:
     is_sensor: Bools
 
 
-def first_sheet(keyframe: Keyframe, rectifier: Rectifier, positions: Floats32 | None, grey: Bytes) -> Sheet | None:
-    """A keyframe's predicted or sensor depth, its holes filled from around; None where there is hardly any."""
+def first_sheet(
+    keyframe: Keyframe, rectifier: Rectifier, positions: Floats32 | None, grey: Bytes
+) -> Sheet | None:
+    """A keyframe's own depth, its holes filled from around; None where there is hardly any."""
     prediction = keyframe.prediction.load()
     depth = keyframe.in_metres(prediction)
     depth = rectifier.nearest(np.where(np.isfinite(depth), depth, 0.0).astype(np.float32), positions)
@@ -53,6 +55,6 @@ def first_sheet(keyframe: Keyframe, rectifier: Rectifier, positions: Floats32 | 
     if not known.all():
         centre = np.float32(np.log(np.median(depth[known])))
         log = np.where(known, np.log(np.where(known, depth, 1.0)) - centre, 0.0)
-        filled, _ = spread(log.astype(np.float32), known.astype(np.float32), grey, _REACH_PX)
+        filled = spread(log.astype(np.float32), known.astype(np.float32), grey, _REACH_PX)
         depth = np.where(known, depth, np.exp(filled + centre)).astype(np.float32)
     return Sheet(depth, sigma, known & prediction.is_sensor)

@@ -37,10 +37,10 @@ def matching_cost(
     """Dissimilarity of a keyframe's pixels to other views, for depths about a sheet.
 
     The cost is one minus the zero-mean normalised cross-correlation of windows, which no change of exposure
-    alters. The variance of noise is added to that of the windows, so what has no texture costs about 1 at every
-    depth. The views are of two sides of the keyframe; what one side sees occluded, the other may see (Kang et
-    al., "Handling occlusions in dense multi-view stereo", CVPR 2001): the cost is the mean of all views' and of
-    the better side's.
+    alters. The variance of noise is added to that of the windows, so what has no texture costs about 1 at
+    every depth. The views are of two sides of the keyframe; what one side sees occluded, the other may see
+    (Kang et al., "Handling occlusions in dense multi-view stereo", CVPR 2001): the cost is the mean of all
+    views' and of the better side's.
 
     Args:
         sheet_m: ``(h, w)`` depth, above 0 everywhere.
@@ -68,7 +68,7 @@ def matching_cost(
             warped = cv2.remap(view.grey, x, y, cv2.INTER_LINEAR, borderValue=0)
             valid = cv2.erode((warped > 0).view(np.uint8), kernel).astype(np.float32)
             other = warped.astype(np.float32)
-            sums = _mean(cv2.merge([other, other * other, other * grey]))
+            sums = _mean(np.asarray(cv2.merge([other, other * other, other * grey]), np.float32))
             covariance = sums[..., 2] - sums[..., 0] * mean
             scatter = np.maximum(sums[..., 1] - sums[..., 0] ** 2, 0.0) + np.float32(_NOISE**2)
             correlation = covariance / np.sqrt(scatter * variance)
@@ -92,9 +92,7 @@ class _Projection:
         height, width = keyframe.grey.shape
         u, v = np.arange(width)[None], np.arange(height)[:, None]
         rows = tuple((row[0] * u + row[1] * v + row[2]).astype(np.float32) for row in M)
-        return cls(
-            (rows[0], rows[1], rows[2]), (camera.K @ T_view_keyframe[:3, 3]).astype(np.float32)
-        )
+        return cls((rows[0], rows[1], rows[2]), (camera.K @ T_view_keyframe[:3, 3]).astype(np.float32))
 
     def pixels(self, depth_m: Floats32) -> tuple[Floats32, Floats32]:
         per_depth = 1.0 / np.maximum(self.along[2] * depth_m + self.offset[2], _NEAREST_M)
@@ -130,4 +128,4 @@ def _combined(total: Floats32, number: Floats32) -> Floats32:
     better = each.min(axis=0)
     cost = np.where((number > 0).all(axis=0), 0.5 * (both + better), better)
     cost[number.sum(axis=0) == 0] = 1.0
-    return np.minimum(cost, _WORST)
+    return np.asarray(np.minimum(cost, _WORST), np.float32)

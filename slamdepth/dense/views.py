@@ -7,7 +7,7 @@ import numpy as np
 
 from slamdepth.geometry import backproject
 from slamdepth.types import Camera
-from slamdepth.typing import Floats, Floats32, Ints
+from slamdepth.typing import Bools, Floats, Floats32, Ints
 
 _GRID_PX = 20
 _BEST_DEG = 6.0
@@ -28,14 +28,14 @@ def surface_points(depth_m: Floats32, camera: Camera, T_world_camera: Floats) ->
     return np.asarray(points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])
 
 
-def seen_share(points_w: Floats, camera: Camera, T_world_camera: Floats) -> tuple[Floats, Floats]:
-    """Which points ``(N, 3)`` lie in the images of cameras, and how far from them.
+def are_seen(points_w: Floats, camera: Camera, T_world_camera: Floats) -> Bools:
+    """Which points ``(N, 3)`` lie in the images of cameras.
 
     Args:
         T_world_camera: ``(C, 4, 4)``.
 
     Returns:
-        ``(is seen (C, N), depth (C, N) in metres)``; the depth of points behind a camera is below 0.
+        ``(C, N)``.
     """
     R, t = T_world_camera[:, :3, :3], T_world_camera[:, :3, 3]
     local = np.einsum("cji,cnj->cni", R, points_w[None] - t[:, None])
@@ -44,7 +44,7 @@ def seen_share(points_w: Floats, camera: Camera, T_world_camera: Floats) -> tupl
     x = local[..., 0] / ahead * camera.fx + camera.cx
     y = local[..., 1] / ahead * camera.fy + camera.cy
     inside = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return inside, z
+    return np.asarray(inside)
 
 
 def choose_views(
@@ -72,9 +72,7 @@ def choose_views(
     distance = float(np.median(np.linalg.norm(rays, axis=1)))
     way = np.linalg.norm(candidates[:, :3, 3] - centre, axis=1)
     looks = candidates[:, :3, 2] @ T_world_camera[:3, 2]
-    near = np.flatnonzero(
-        (way > 0) & (way < distance) & (looks > np.cos(np.deg2rad(_OTHERWISE_DEG)))
-    )
+    near = np.flatnonzero((way > 0) & (way < distance) & (looks > np.cos(np.deg2rad(_OTHERWISE_DEG))))
     if len(near) > _TRIED:
         near = near[np.round(np.linspace(0, len(near) - 1, _TRIED)).astype(np.int64)]
     worth = _worth(points_w, rays, camera, candidates[near])
@@ -94,7 +92,7 @@ def choose_views(
 
 
 def _worth(points_w: Floats, rays: Floats, camera: Camera, T_world_camera: Floats) -> Floats:
-    inside, z = seen_share(points_w, camera, T_world_camera)
+    inside = are_seen(points_w, camera, T_world_camera)
     share = inside.mean(axis=1)
     other = points_w[None] - T_world_camera[:, None, :3, 3]
     cosine = np.einsum("nj,cnj->cn", rays, other)

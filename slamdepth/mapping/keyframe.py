@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slamdepth.mapping.dense_depth import StoredDenseDepth
 from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
-from slamdepth.mapping.surface import StoredSurface
 from slamdepth.types import DepthPrediction
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Keyframe:
         in_metres: turns the prediction into ``(H, W)`` float32 depth in metres of the map.
         point_rows: ``(N,)`` row of each keypoint's landmark in ``Reconstruction.points_m``, -1 for none;
             empty where the odometry has no landmarks.
-        surface: handle of dense depth measured from many views, or None where there is none.
+        dense: handle of dense depth measured from many views, or None where there is none.
     """
 
     id: int
@@ -45,7 +45,7 @@ class Keyframe:
     prediction: StoredPrediction
     in_metres: Callable[[DepthPrediction], NDArray[np.float32]]
     point_rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    surface: StoredSurface | None = None
+    dense: StoredDenseDepth | None = None
 
     def load_depth_m(self) -> NDArray[np.float32]:
         """Dense depth ``(H, W)`` float32 in metres of the map, 0 where unknown or rejected.
@@ -66,5 +66,5 @@ class Keyframe:
             T_world_camera=T,
             depth_scale=self.depth_scale * factor,
             in_metres=lambda prediction: self.in_metres(prediction) * np.float32(factor),
-            surface=None if self.surface is None else self.surface.rescaled(factor),
+            dense=None if self.dense is None else self.dense.rescaled(factor),
         )

@@ -67,6 +67,7 @@ class RunStage(str, Enum):
     TRACKING = "tracking"
     OPTIMISING = "optimising"
     MARKERS = "looking for markers"
+    DENSE = "measuring depth from many views"
     MESHING = "meshing"
     DRAWING = "drawing the mesh"
     SCORING = "scoring"
@@ -81,7 +82,7 @@ class RunProgress:
     Attributes:
         stage: what the run is doing.
         done, total: frames while tracking, fitting, looking for markers and scoring the mesh, keyframes
-            while meshing.
+            while meshing, steps of the work while measuring depth.
         fps: frames per second so far.
         status: of the last frame, None before the first.
         keyframes, loop_closures: totals so far.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surface that a keyframe sees, as a pinhole camera with a global shutter would see it."""
+"""Dense depth of a keyframe with its deviation, as a pinhole camera with a global shutter would see it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Surface:
+class DenseDepth:
     """Dense depth with its deviation.
 
     Attributes:
@@ -36,11 +36,11 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class StoredSurface:
-    """Handle of a surface in a temporary file.
+class StoredDenseDepth:
+    """Handle of dense depth in a temporary file.
 
     Attributes:
-        camera: as for :class:`Surface`; always in memory.
+        camera: as for :class:`DenseDepth`; always in memory.
         unit: factor on the depth.
     """
 
@@ -51,22 +51,22 @@ class StoredSurface:
     unit: float = 1.0
 
     @classmethod
-    def of(cls, surface: Surface, file: SpillFile) -> StoredSurface:
-        """Write a surface to ``file``, depth and deviation to three digits, colours as a JPEG."""
-        sigma = np.where(surface.is_measured, surface.sigma_log, -surface.sigma_log)
+    def of(cls, depth: DenseDepth, file: SpillFile) -> StoredDenseDepth:
+        """Write dense depth to ``file``, depth and deviation to three digits, colours as a JPEG."""
+        sigma = np.where(depth.is_measured, depth.sigma_log, -depth.sigma_log)
         return cls(
-            surface.camera,
-            file.spill(encode_image(surface.image_rgb)),
-            file.spill(encode_half_precision(surface.depth_m)),
+            depth.camera,
+            file.spill(encode_image(depth.image_rgb)),
+            file.spill(encode_half_precision(depth.depth_m)),
             file.spill(encode_half_precision(sigma.astype(np.float32))),
         )
 
-    def load(self) -> Surface:
-        """The surface, read from the file each time."""
+    def load(self) -> DenseDepth:
+        """The dense depth, read from the file each time."""
         signed = self._sigma.load()
         depth_m = self._depth.load() * np.float32(self.unit)
-        return Surface(self.camera, self._image.load(), depth_m, np.abs(signed), signed > 0)
+        return DenseDepth(self.camera, self._image.load(), depth_m, np.abs(signed), signed > 0)
 
-    def rescaled(self, factor: float) -> StoredSurface:
-        """The surface in a map whose lengths are multiplied by ``factor``."""
+    def rescaled(self, factor: float) -> StoredDenseDepth:
+        """The same depth in a map whose lengths are multiplied by ``factor``."""
         return replace(self, unit=self.unit * factor)
