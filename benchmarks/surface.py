@@ -67,10 +67,10 @@ _HEADINGS = ("sequence", "row", "accuracy, median / RMSE cm", "completion, media
 
 
 def dense_modes() -> tuple[str, ...]:
-    """Values of the setting ``dense.mode``; ``off`` alone where the settings do not know it."""
+    """Values of the setting ``dense.mode`` but ``auto``; ``off`` alone where the settings do not know it."""
     section = Config.model_fields.get("dense")
     field = getattr(section.annotation, "model_fields", {}).get("mode") if section is not None else None
-    return ("off",) if field is None else tuple(get_args(field.annotation))
+    return ("off",) if field is None else tuple(mode for mode in get_args(field.annotation) if mode != "auto")
 
 
 def row_names() -> tuple[str, ...]:

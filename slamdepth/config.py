@@ -240,9 +240,10 @@ class MapConfig(_Section):
 class DenseConfig(_Section):
     """Dense depth of keyframes from many views, at the end of a run."""
 
-    mode: Literal["off", "fast", "best"] = Field(
-        "fast",
-        description="'off' keeps the depth model's relief; 'best' looks twice, with more views; slower",
+    mode: Literal["auto", "off", "fast", "best"] = Field(
+        "auto",
+        description="'off' keeps the depth that was given; 'best' looks twice, at more views; 'auto' is "
+        "'fast' for predicted depth, 'off' for a sensor's",
     )
 
 

@@ -123,8 +123,8 @@ def run_command(
         str | None,
         typer.Option(
             metavar="off|fast|best",
-            help="Depth of the keyframes from many views, for the mesh: half a second a keyframe, or two. "
-            "Default: fast",
+            help="Measure the depth of keyframes from many views, for the mesh; 'best' takes three times as "
+            "long. Default: fast for predicted depth, off for a sensor's",
         ),
     ] = None,
     no_mesh: Annotated[bool, typer.Option("--no-mesh", help="Make no mesh.")] = False,

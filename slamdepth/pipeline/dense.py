@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset
-from slamdepth.dense import EFFORTS, SourceFrame, densify
+from slamdepth.dense import EFFORTS, Effort, SourceFrame, densify
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
 from slamdepth.types import StepResult
@@ -29,7 +29,7 @@ def measure_surfaces(
     Args:
         steps: of the tracker; they tell which frame has which time.
     """
-    effort = EFFORTS.get(config.dense.mode)
+    effort = _effort(reconstruction, config)
     if effort is None:
         return reconstruction
     index = {step.timestamp_s: step.index for step in steps}
@@ -51,3 +51,10 @@ def measure_surfaces(
         effort,
         lambda done, total: tell(RunProgress(RunStage.DENSE, done, total)),
     )
+
+
+def _effort(reconstruction: Reconstruction, config: Config) -> Effort | None:
+    mode = config.dense.mode
+    if mode == "auto":
+        mode = "off" if any(kf.prediction.is_sensor for kf in reconstruction.keyframes) else "fast"
+    return EFFORTS.get(mode)
