@@ -14,6 +14,7 @@ from slamdepth._version import __version__
 if TYPE_CHECKING:
     from slamdepth.config import Config
     from slamdepth.datasets import Dataset, open_dataset
+    from slamdepth.dense import densify
     from slamdepth.depth.base import DepthModel
     from slamdepth.depth.registry import create_depth_model
     from slamdepth.errors import (
@@ -93,6 +94,7 @@ _HOME = {
     "WeightsInfo": "slamdepth.types",
     "create_depth_model": "slamdepth.depth.registry",
     "create_tracker": "slamdepth.tracking",
+    "densify": "slamdepth.dense",
     "open_dataset": "slamdepth.datasets",
     "read_tum_trajectory": "slamdepth.io",
     "run": "slamdepth.pipeline.run",
@@ -143,6 +145,7 @@ __all__ = [
     "__version__",
     "create_depth_model",
     "create_tracker",
+    "densify",
     "open_dataset",
     "read_tum_trajectory",
     "run",

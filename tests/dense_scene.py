@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slamdepth.dense import SourceFrame
+from slamdepth.datasets import Dataset
 from slamdepth.errors import ImageDecodeError
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
@@ -51,30 +51,37 @@ def image(x_m: float, camera: Camera = CAMERA, *, textured: bool = True) -> NDAr
     return np.repeat(np.clip(grey, 1, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
-@dataclass
-class Walk:
-    """Seven keyframes and the frames between them.
+class Walk(Dataset):
+    """Seven keyframes, and all frames as a dataset.
 
     Attributes:
         error: factor ``(h, w)`` that the predictions are off by.
+        broken: indices of images that do not decode.
     """
 
-    reconstruction: Reconstruction
-    frames: list[SourceFrame]
-    error: NDArray[np.float32]
-    broken: tuple[int, ...] = ()
-    textured: bool = True
+    name, path, camera, has_depth, ground_truth = "walk", Path("walk"), CAMERA, False, None
 
-    def read(self, index: int) -> NDArray[np.uint8]:
+    def __init__(
+        self, reconstruction: Reconstruction, error: NDArray[np.float32], *, textured: bool = True
+    ) -> None:
+        self.reconstruction, self.error, self.textured = reconstruction, error, textured
+        self.timestamps_s = reconstruction.trajectory.timestamps_s
+        self.notes: list[str] = []
+        self.broken: tuple[int, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.timestamps_s)
+
+    def read(self, index: int, *, with_depth: bool = False) -> Frame:
         if index in self.broken:
             raise ImageDecodeError(f"frame {index}")
-        return image(self.frames[index].T_world_camera[0, 3], textured=self.textured)
+        x_m = self.reconstruction.trajectory.T_world_camera[index, 0, 3]
+        return Frame(index, float(self.timestamps_s[index]), image(x_m, textured=self.textured), CAMERA)
 
 
 def walk(*, textured: bool = True, is_sensor: bool = False) -> Walk:
     """Depth of the keyframes is a wave about the truth, or a sensor's with its right half missing."""
     places = np.linspace(0.0, 0.9, 19)
-    frames = [SourceFrame(i, 0.1 * i, pose(x)) for i, x in enumerate(places)]
     u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     error = np.exp(0.15 * np.sin(u / 25.0) * np.cos(v / 20.0)).astype(np.float32)
     keyframes = []
@@ -92,9 +99,6 @@ def walk(*, textured: bool = True, is_sensor: bool = False) -> Walk:
                 lambda given: given.values,
             )
         )  # fmt: skip
-    trajectory = Trajectory(
-        np.array([frame.timestamp_s for frame in frames]), np.array([f.T_world_camera for f in frames])
-    )
-    return Walk(
-        Reconstruction(trajectory, tuple(keyframes), np.zeros((0, 3))), frames, error, textured=textured
-    )
+    times_s: NDArray[np.float64] = 0.1 * np.arange(19.0)
+    trajectory = Trajectory(times_s, np.array([pose(x) for x in places]))
+    return Walk(Reconstruction(trajectory, tuple(keyframes), np.zeros((0, 3))), error, textured=textured)

@@ -22,6 +22,7 @@ def video_to_mesh(dataset: slamdepth.Dataset, depth: str, mesh_path: Path) -> st
             result = tracker.step(frame)
             print(f"{result.timestamp_s:.3f} s: {result.status.value}")
         reconstruction = tracker.finish()
+    reconstruction = slamdepth.densify(reconstruction, dataset)
     mesh = reconstruction.fuse_mesh(voxel_size_m=0.02)
     mesh.save(mesh_path)
     return f"{mesh_path}: from {len(reconstruction.keyframes)} keyframes of {len(dataset)} frames"

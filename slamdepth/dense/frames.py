@@ -3,87 +3,67 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from slamdepth.dense.rectify import Rectifier
 from slamdepth.dense.sweep import View
-from slamdepth.errors import ImageDecodeError
 from slamdepth.frontend.rolling_shutter import velocity_between
 from slamdepth.geometry import invert
-from slamdepth.typing import Bytes, Floats
-
-log = logging.getLogger(__name__)
+from slamdepth.types import Trajectory
+from slamdepth.typing import Bytes, Floats, Floats32
 
 _CONSECUTIVE_S = 0.2  # frames farther apart tell no velocity
 
 
-@dataclass(frozen=True)
-class SourceFrame:
-    """A frame with a pose.
-
-    Attributes:
-        index: of its image.
-        timestamp_s: seconds.
-        T_world_camera: ``(4, 4)``.
-    """
-
-    index: int
-    timestamp_s: float
-    T_world_camera: Floats
-
-
 class FrameViews:
-    """Rectified images of frames.
+    """Rectified images of the frames of a trajectory, named by their rows in it.
 
     Args:
-        frames: in order of time.
-        read: gives the ``(H, W, 3)`` uint8 image of an index.
+        trajectory: of all frames.
+        read: gives the ``(H, W, 3)`` uint8 image of a row, or None where there is none.
         inverse_depth: 1/m, of the scene in general.
     """
 
     def __init__(
         self,
-        frames: Sequence[SourceFrame],
-        read: Callable[[int], Bytes],
+        trajectory: Trajectory,
+        read: Callable[[int], Bytes | None],
         rectifier: Rectifier,
         inverse_depth: float,
     ) -> None:
-        self._frames, self._read, self._rectifier = frames, read, rectifier
-        self.inverse_depth = inverse_depth
-        self._row = {frame.index: row for row, frame in enumerate(frames)}
+        self._trajectory, self._read, self._rectifier = trajectory, read, rectifier
+        self._inverse_depth = inverse_depth
         self._views: dict[int, View | None] = {}
 
-    def velocity(self, index: int) -> Floats | None:
-        """Velocity ``(6,)`` of the camera at a frame, from those before and after it; None where unknown."""
-        row = self._row[index]
-        before, after = self._frames[max(0, row - 1)], self._frames[min(len(self._frames) - 1, row + 1)]
-        interval_s = after.timestamp_s - before.timestamp_s
+    def positions(self, row: int) -> Floats32 | None:
+        """Where the rectified pixels of a frame come from, see :meth:`Rectifier.positions`."""
+        return self._rectifier.positions(self._velocity(row), self._inverse_depth)
+
+    def made(self, row: int, image_rgb: Bytes) -> View:
+        """The view of a frame with this image."""
+        grey = self._rectifier.grey(image_rgb, self.positions(row))
+        return View(np.ascontiguousarray(grey), self._trajectory.T_world_camera[row])
+
+    def load(self, rows: Iterable[int]) -> None:
+        """Read what is asked for and not there yet, in order, and forget all others."""
+        wanted = sorted(set(rows))
+        self._views = {row: self._views[row] for row in wanted if row in self._views}
+        for row in wanted:
+            if row not in self._views:
+                image_rgb = self._read(row)
+                self._views[row] = None if image_rgb is None else self.made(row, image_rgb)
+
+    def get(self, row: int) -> View | None:
+        """The view of a frame that was loaded; None where it has no image."""
+        return self._views[row]
+
+    def _velocity(self, row: int) -> Floats | None:
+        """Velocity ``(6,)`` of the camera, from the frames before and after; None where unknown."""
+        times_s, poses = self._trajectory.timestamps_s, self._trajectory.T_world_camera
+        before, after = max(0, row - 1), min(len(times_s) - 1, row + 1)
+        interval_s = float(times_s[after] - times_s[before])
         if not 0 < interval_s <= 2 * _CONSECUTIVE_S:
             return None
-        return velocity_between(invert(before.T_world_camera), invert(after.T_world_camera), interval_s)
-
-    def load(self, indices: Iterable[int]) -> None:
-        """Read what is asked for and not there yet, in order, and forget all others."""
-        wanted = sorted(set(indices))
-        self._views = {index: self._views[index] for index in wanted if index in self._views}
-        for index in wanted:
-            if index not in self._views:
-                self._views[index] = self._made(index)
-
-    def get(self, index: int) -> View | None:
-        """The view of a frame that was loaded; None where its image does not decode."""
-        return self._views[index]
-
-    def _made(self, index: int) -> View | None:
-        try:
-            image_rgb = self._read(index)
-        except ImageDecodeError as error:
-            log.debug("frame %d is no view: %s", index, error)
-            return None
-        positions = self._rectifier.positions(self.velocity(index), self.inverse_depth)
-        grey = self._rectifier.grey(image_rgb, positions)
-        return View(np.ascontiguousarray(grey), self._frames[self._row[index]].T_world_camera)
+        return velocity_between(invert(poses[before]), invert(poses[after]), interval_s)

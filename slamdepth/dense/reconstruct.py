@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,22 +13,25 @@ from typing import TypeVar
 
 import numpy as np
 
+from slamdepth.datasets import Dataset
 from slamdepth.dense.agreement import agreement
-from slamdepth.dense.frames import FrameViews, SourceFrame
+from slamdepth.dense.frames import FrameViews
 from slamdepth.dense.fuse import fuse
 from slamdepth.dense.measure import measure
 from slamdepth.dense.rectify import Rectifier
 from slamdepth.dense.sheet import first_sheet
-from slamdepth.dense.sweep import View
 from slamdepth.dense.views import are_seen, choose_views, surface_points
+from slamdepth.errors import ConfigError, ImageDecodeError
 from slamdepth.mapping.codec import encode_half_precision
 from slamdepth.mapping.dense_depth import DenseDepth, StoredDenseDepth
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapping.spill_file import SpilledArray, SpillFile
 from slamdepth.thread_limits import single_threaded
-from slamdepth.types import Camera
+from slamdepth.types import Camera, Trajectory
 from slamdepth.typing import Bytes, Floats, Floats32
+
+log = logging.getLogger(__name__)
 
 _S = TypeVar("_S")
 _T = TypeVar("_T")
@@ -60,27 +64,32 @@ EFFORTS = {
 
 def densify(
     reconstruction: Reconstruction,
-    frames: Sequence[SourceFrame],
-    read: Callable[[int], Bytes],
-    effort: Effort,
+    dataset: Dataset | None = None,
+    effort: Effort | str = "fast",
     progress: Callable[[int, int], None] | None = None,
 ) -> Reconstruction:
-    """Measure the surface of each keyframe from the frames about it.
+    """Measure the depth of each keyframe from the frames about it.
 
     Args:
         reconstruction: a finished map, with keyframes' depth by a network or a sensor.
-        frames: all placed frames, in order of time; those of the keyframes are among them.
-        read: gives the ``(H, W, 3)`` uint8 image of a frame that is no keyframe; an ``ImageDecodeError``
-            leaves it out.
-        effort: see :data:`EFFORTS`.
+        dataset: what was tracked; all its frames become views. Without it those of the keyframes do.
+        effort: "fast", "best" or one of your own.
         progress: called with (steps done, steps in all).
 
     Returns:
-        The same map; each keyframe with depth has ``dense`` depth. The same input gives the same bytes.
+        The same map; each keyframe with depth has ``dense`` depth, which :meth:`Reconstruction.fuse_mesh`
+        takes. The same input gives the same bytes.
+
+    Raises:
+        ConfigError: there is no effort of this name.
     """
+    if isinstance(effort, str):
+        if effort not in EFFORTS:
+            raise ConfigError(f"effort must be one of {', '.join(EFFORTS)}, got {effort!r}")
+        effort = EFFORTS[effort]
     if len(reconstruction.keyframes) < 2:
         return reconstruction
-    job = _Job(reconstruction, frames, read, effort, progress or (lambda done, total: None))
+    job = _Job(reconstruction, dataset, effort, progress or (lambda done, total: None))
     with single_threaded(), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         depths = job.run(pool)
     return replace(
@@ -94,6 +103,7 @@ class _State:
     """A keyframe while it is worked on; its maps, ``(h, w)`` at the working size, are in a file."""
 
     keyframe: Keyframe
+    row: int  # of its frame in the trajectory
     points_w: Floats
     maps: dict[str, SpilledArray] = field(default_factory=dict)
 
@@ -104,24 +114,21 @@ class _Job:
     def __init__(
         self,
         reconstruction: Reconstruction,
-        frames: Sequence[SourceFrame],
-        read: Callable[[int], Bytes],
+        dataset: Dataset | None,
         effort: Effort,
         progress: Callable[[int, int], None],
     ) -> None:
-        keyframes = reconstruction.keyframes
+        trajectory = reconstruction.trajectory
+        self._row = {time_s: row for row, time_s in enumerate(trajectory.timestamps_s.tolist())}
+        keyframes = [kf for kf in reconstruction.keyframes if kf.frame.timestamp_s in self._row]
         self._rectifier = Rectifier.of(
             keyframes[0].frame.camera, effort.width, reconstruction.statistics.readout_s or 0.0
         )
         self._camera = self._rectifier.camera
-        self._keyframes, self._effort, self._frames = keyframes, effort, list(frames)
-        self._poses = np.array([frame.T_world_camera for frame in frames])
-        images = {kf.frame.index: kf for kf in keyframes}
-
-        def image_of(index: int) -> Bytes:
-            return images[index].frame.load().image_rgb if index in images else read(index)
-
-        self._views = FrameViews(self._frames, image_of, self._rectifier, _inverse_depth(keyframes))
+        self._keyframes, self._effort = keyframes, effort
+        images = _Images(trajectory, keyframes, dataset)
+        self._candidates, self._poses = images.rows, trajectory.T_world_camera[images.rows]
+        self._views = FrameViews(trajectory, images.read, self._rectifier, _inverse_depth(keyframes))
         self._file = SpillFile()
         self._progress = progress
         self._done, self._total = 0, len(keyframes) * (1 + 2 * len(effort.rounds))
@@ -142,10 +149,8 @@ class _Job:
         """Depth by the views of all keyframes, a batch at a time: their images have to be in memory."""
         for start in range(0, len(states), _BATCH):
             batch = states[start : start + _BATCH]
-            chosen = {state.keyframe.id: self._chosen(state) for state in batch}
-            self._views.load(
-                index for state in batch for index in (state.keyframe.frame.index, *chosen[state.keyframe.id])
-            )
+            chosen = {state.row: self._chosen(state) for state in batch}
+            self._views.load(row for state in batch for row in (state.row, *chosen[state.row]))
             measure_one = partial(self._measure, chosen=chosen, reach_log=reach_log, labels=labels)
             self._each(pool, measure_one, batch)
 
@@ -162,20 +167,14 @@ class _Job:
         for name, values in maps.items():
             state.maps[name] = self._file.spill(encode_half_precision(values))
 
-    def _view(self, keyframe: Keyframe) -> tuple[View, Floats32 | None]:
-        positions = self._rectifier.positions(
-            self._views.velocity(keyframe.frame.index), self._views.inverse_depth
-        )
-        grey = self._rectifier.grey(keyframe.frame.load().image_rgb, positions)
-        return View(grey, keyframe.T_world_camera), positions
-
     def _begin(self, keyframe: Keyframe) -> _State | None:
         """The sheet of a keyframe."""
-        view, positions = self._view(keyframe)
-        sheet = first_sheet(keyframe, self._rectifier, positions, view.grey)
+        row = self._row[keyframe.frame.timestamp_s]
+        grey = self._views.made(row, keyframe.frame.load().image_rgb).grey
+        sheet = first_sheet(keyframe, self._rectifier, self._views.positions(row), grey)
         if sheet is None:
             return None
-        state = _State(keyframe, surface_points(sheet.depth_m, self._camera, keyframe.T_world_camera))
+        state = _State(keyframe, row, surface_points(sheet.depth_m, self._camera, keyframe.T_world_camera))
         sign = np.where(sheet.is_sensor, np.float32(-1.0), np.float32(1.0))
         self._put(state, sheet=sheet.depth_m, sigma=sheet.sigma_log * sign, present=sheet.depth_m)
         return state
@@ -184,16 +183,16 @@ class _Job:
         rows = choose_views(
             state.points_w, self._camera, state.keyframe.T_world_camera, self._poses, self._effort.views
         )
-        return [self._frames[row].index for row in rows]
+        return [int(row) for row in self._candidates[rows]]
 
     def _measure(self, state: _State, chosen: dict[int, list[int]], reach_log: float, labels: int) -> None:
         """Depth by the views, about the present one."""
         present = state.maps["present"].load()
-        views = [view for index in chosen[state.keyframe.id] if (view := self._views.get(index)) is not None]
+        views = [view for row in chosen[state.row] if (view := self._views.get(row)) is not None]
         if len(views) < 2:
             self._put(state, found=present, evidence=np.zeros_like(present))
             return
-        keyframe = self._views.get(state.keyframe.frame.index)
+        keyframe = self._views.get(state.row)
         assert keyframe is not None
         measured = measure(keyframe, present, views, self._camera, reach_log, labels)
         self._put(state, found=present * np.exp(measured.log_ratio), evidence=measured.evidence)
@@ -213,12 +212,50 @@ class _Job:
             [(other.maps["found"].load(), other.keyframe.T_world_camera) for other in others],
             self._camera,
         )
-        view, positions = self._view(keyframe)
-        fused = fuse(sheet, np.abs(signed), signed < 0, found, evidence, agreed, view.grey)
+        image_rgb = keyframe.frame.load().image_rgb
+        grey = self._views.made(state.row, image_rgb).grey
+        fused = fuse(sheet, np.abs(signed), signed < 0, found, evidence, agreed, grey)
         self._put(state, present=fused.complete_m)
-        image_rgb = self._rectifier.color(keyframe.frame.load().image_rgb, positions)
-        depth = DenseDepth(self._camera, image_rgb, fused.depth_m, fused.sigma_log, fused.is_measured)
+        color = self._rectifier.color(image_rgb, self._views.positions(state.row))
+        depth = DenseDepth(self._camera, color, fused.depth_m, fused.sigma_log, fused.is_measured)
         return StoredDenseDepth.of(depth, self._file)
+
+
+class _Images:
+    """The images of a trajectory's frames.
+
+    Attributes:
+        rows: of the trajectory, those that may have an image.
+    """
+
+    def __init__(
+        self, trajectory: Trajectory, keyframes: Sequence[Keyframe], dataset: Dataset | None
+    ) -> None:
+        self._keyframes = {kf.frame.timestamp_s: kf for kf in keyframes}
+        self._dataset = dataset
+        times_s = [] if dataset is None else dataset.timestamps_s.tolist()
+        self._index = {time_s: index for index, time_s in enumerate(times_s)}
+        self._times_s: list[float] = trajectory.timestamps_s.tolist()
+        self.rows = np.array(
+            [
+                row
+                for row, time_s in enumerate(self._times_s)
+                if time_s in self._keyframes or time_s in self._index
+            ],
+            dtype=np.int64,
+        )
+
+    def read(self, row: int) -> Bytes | None:
+        """The image of a row; None where it does not decode."""
+        time_s = self._times_s[row]
+        if time_s in self._keyframes:
+            return self._keyframes[time_s].frame.load().image_rgb
+        assert self._dataset is not None
+        try:
+            return self._dataset.read(self._index[time_s]).image_rgb
+        except ImageDecodeError as error:
+            log.debug("a frame is no view: %s", error)
+            return None
 
 
 def _inverse_depth(keyframes: Sequence[Keyframe]) -> float:

@@ -13,14 +13,13 @@ from slamdepth.errors import SlamdepthError
 from slamdepth.io import write_tum_trajectory
 from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.pipeline.dense import measure_surfaces
+from slamdepth.pipeline.dense import measure_depth
 from slamdepth.pipeline.folder import RunFolder
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
 from slamdepth.pipeline.prediction_scale import PredictionScale
 from slamdepth.pipeline.results import judge_trajectory, keyframe_trajectory, write_keyframe_mesh
 from slamdepth.pipeline.scale import scale_of_other
 from slamdepth.report import MapData, MeshCounts, MeshImage, write_mesh_png
-from slamdepth.types import StepResult
 
 logger = logging.getLogger(__name__)
 
@@ -92,14 +91,12 @@ def finish_others(
     folder: RunFolder,
     tell: ProgressCallback,
     *,
-    steps: Sequence[StepResult],
     mesh: bool,
     is_measured: bool,
 ) -> tuple[tuple[MapData, ...], tuple[str, ...]]:
     """Mesh and score the maps that never met the largest one.
 
     Args:
-        steps: of the tracker.
         mesh: write their ``mesh.ply``.
         is_measured: a sensor measured the depth.
 
@@ -110,7 +107,7 @@ def finish_others(
     notes: list[str] = []
     for number, one in enumerate(others, start=2):
         if mesh:
-            dense = measure_surfaces(dataset, one.reconstruction, steps, config, tell)
+            dense = measure_depth(dataset, one.reconstruction, config, tell)
             made, _, lines = write_mesh(folder, number, dense, config, tell)
             one = replace(one, mesh=MeshCounts.of(made), reconstruction=dense)
             notes += lines

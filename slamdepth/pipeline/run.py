@@ -23,7 +23,7 @@ from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.frontend.features import feature_weights
 from slamdepth.io import write_text
 from slamdepth.mapping.mesh import Mesh
-from slamdepth.pipeline.dense import measure_surfaces
+from slamdepth.pipeline.dense import measure_depth
 from slamdepth.pipeline.folder import FILES, MAPS, MAPS_CONTENT, RunFolder, run_log, write_log_to
 from slamdepth.pipeline.maps import finish_others, settle_others, write_mesh, write_trajectories
 from slamdepth.pipeline.options import (
@@ -219,7 +219,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     mesh: Mesh | None = None
     mesh_images: tuple[MeshImage, ...] = ()
     if job.options.mesh:
-        reconstruction = measure_surfaces(dataset, reconstruction, tracked.steps, config, tell)
+        reconstruction = measure_depth(dataset, reconstruction, config, tell)
         mesh, mesh_images, mesh_notes = write_mesh(folder, 1, reconstruction, config, tell)
         notes += mesh_notes
     is_measured = job.depth_is_measured
@@ -229,7 +229,6 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
         config,
         folder,
         tell,
-        steps=tracked.steps,
         mesh=job.options.mesh,
         is_measured=is_measured,
     )
