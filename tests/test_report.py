@@ -76,6 +76,7 @@ def test_summary_has_the_promised_keys_and_values() -> None:
     assert (scale["source"], scale["factor"], scale["uncertainty_log"]) == ("camera-height", 1.2, 0.03)
     assert (scale["keyframes"], scale["spread"], scale["sentence"]) == (6, 0.1, SCALE.sentence)
     assert [part["source"] for part in scale["parts"]] == ["network", "camera-height", "marker"]
+    assert summary["dense"] == {"keyframes": 0, "measured": None}
     assert summary["mesh"] == {"vertices": 1234, "triangles": 5678}
     assert summary["surface"]["sim3"]["accuracy"]["median_m"] == pytest.approx(0.03, abs=1e-4)
     assert [summary["surface"][key]["within"]["5cm"]["f_score"] for key in ("se3", "sim3")] == [0.0, 1.0]

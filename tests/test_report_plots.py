@@ -12,8 +12,10 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from report_data import bare_data, full_data, keyframe
+from report_data import CAMERA, bare_data, full_data, keyframe
 
+from slamdepth.mapping.dense_depth import DenseDepth, StoredDenseDepth
+from slamdepth.mapping.spill_file import SpillFile
 from slamdepth.report import (
     build_html,
     build_summary,
@@ -119,12 +121,18 @@ def test_the_gallery_spreads_over_the_run_and_shows_the_sensor_next_to_a_predict
     assert predicted is not None
     assert [keyframe.id for keyframe in predicted.keyframes] == [0, 3, 6]
     assert all([*shown.images] == ["image", "depth", "sensor depth"] for shown in predicted.keyframes)
-    assert predicted.has_sensor
+    assert predicted.is_wide
     assert 0.5 <= predicted.near_m < predicted.far_m <= 4.0
     sensor = keyframe_gallery((keyframe(0, is_sensor=True),))
     assert sensor is not None
     assert [[*shown.images] for shown in sensor.keyframes] == [["image", "depth"]]
-    assert not sensor.has_sensor
+    assert not sensor.is_wide
+    depth = np.full((12, 16), 2.0, np.float32)
+    image = np.zeros((12, 16, 3), np.uint8)
+    dense = DenseDepth(CAMERA.scaled(16, 12), image, depth, depth, np.ones((12, 16), np.bool_))
+    measured = keyframe_gallery((replace(keyframe(0), dense=StoredDenseDepth.of(dense, SpillFile())),))
+    assert measured is not None
+    assert "depth from many views" in measured.keyframes[0].images
     unknown = replace(keyframe(0), in_metres=lambda prediction: np.zeros_like(prediction.values))
     assert keyframe_gallery((unknown,)) is not None
     assert keyframe_gallery(()) is None

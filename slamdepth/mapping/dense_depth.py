@@ -41,10 +41,12 @@ class StoredDenseDepth:
 
     Attributes:
         camera: as for :class:`DenseDepth`; always in memory.
+        measured_share: of the pixels, those that several views or a sensor measured.
         unit: factor on the depth.
     """
 
     camera: Camera
+    measured_share: float
     _image: SpilledArray
     _depth: SpilledArray
     _sigma: SpilledArray
@@ -56,6 +58,7 @@ class StoredDenseDepth:
         sigma = np.where(depth.is_measured, depth.sigma_log, -depth.sigma_log)
         return cls(
             depth.camera,
+            float(depth.is_measured.mean()),
             file.spill(encode_image(depth.image_rgb)),
             file.spill(encode_half_precision(depth.depth_m)),
             file.spill(encode_half_precision(sigma.astype(np.float32))),

@@ -43,6 +43,9 @@ def run_table(summary: dict[str, Any]) -> Table:
     depth = summary["depth"]["metric"]
     if depth["abs_rel"] is not None:
         rows.append(("depth", f"AbsRel {fixed(depth['abs_rel'], 3)}, δ < 1.25: {percent(depth['delta1'])}"))
+    dense = summary["dense"]
+    if dense["keyframes"]:
+        rows.append(("depth from many views", f"{percent(dense['measured'])} of the keyframes' pixels"))
     mesh = summary["mesh"]
     if mesh["vertices"] is not None:
         rows.append(("mesh", f"{count(mesh['vertices'])} vertices, {count(mesh['triangles'])} triangles"))

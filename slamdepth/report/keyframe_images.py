@@ -29,8 +29,8 @@ class KeyframeImages:
     Attributes:
         id: number of the keyframe.
         seconds: since the first keyframe.
-        images: a ``data:`` address for each name: ``image``, ``depth`` and, unless the depth is measured
-            or there is no sensor, ``sensor depth``.
+        images: a ``data:`` address for each name: ``image``, ``depth``, where it was measured ``depth
+            from many views`` and, unless the depth is a sensor's or there is none, ``sensor depth``.
     """
 
     id: int
@@ -47,9 +47,9 @@ class Gallery:
     far_m: float
 
     @property
-    def has_sensor(self) -> bool:
-        """True where a keyframe shows the sensor's depth next to the prediction."""
-        return any("sensor depth" in keyframe.images for keyframe in self.keyframes)
+    def is_wide(self) -> bool:
+        """True where a keyframe has more than its image and one depth map."""
+        return any(len(keyframe.images) > 2 for keyframe in self.keyframes)
 
 
 def colour_depth(
@@ -100,6 +100,9 @@ def _images_of(keyframe: Keyframe, start_s: float, near_m: float, far_m: float) 
         "image": _small(frame.image_rgb, smooth=True),
         "depth": _small(colour_depth(keyframe.load_depth_m(), near_m, far_m), smooth=False),
     }
+    if keyframe.dense is not None:
+        dense_m = keyframe.dense.load().depth_m
+        images["depth from many views"] = _small(colour_depth(dense_m, near_m, far_m), smooth=False)
     sensor_m = None if keyframe.prediction.is_sensor else frame.depth_m
     if sensor_m is not None:
         images["sensor depth"] = _small(colour_depth(sensor_m, near_m, far_m), smooth=False)

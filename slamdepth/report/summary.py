@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from slamdepth.evaluation import DepthScore, surface_figures
+from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.report.data import ReportData
 from slamdepth.report.environment import hardware, versions
 from slamdepth.report.maps import first_timestamp_s, map_figures, mesh_figures, trajectory_figures
@@ -46,6 +48,7 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         "wall_s": statistics.frames / data.fps if data.fps > 0 else None,
         **trajectory_figures(data.trajectory_score),
         "depth": _depth(data.depth_score),
+        "dense": _dense(run.keyframes),
         "mesh": mesh_figures(data.maps[0]),
         "surface": surface_figures(data.surface_scores),
         "maps": maps,
@@ -57,6 +60,11 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         "versions": versions(),
         "hardware": hardware(),
     }
+
+
+def _dense(keyframes: Sequence[Keyframe]) -> dict[str, Any]:
+    shares = [keyframe.dense.measured_share for keyframe in keyframes if keyframe.dense is not None]
+    return {"keyframes": len(shares), "measured": sum(shares) / len(shares) if shares else None}
 
 
 def _depth(score: DepthScore | None) -> dict[str, Any]:
