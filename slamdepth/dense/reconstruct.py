@@ -58,7 +58,7 @@ class Effort:
 
 EFFORTS = {
     "fast": Effort(320, 6, ((0.42, 33),)),
-    "best": Effort(320, 8, ((0.42, 49), (0.2, 41))),
+    "best": Effort(480, 8, ((0.42, 49), (0.1, 21))),
 }
 
 
