@@ -13,7 +13,7 @@ from slamdepth.errors import ImageDecodeError
 from slamdepth.evaluation import Surface
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.sensor_surface import SensorFrame, fuse_sensor
-from slamdepth.mapping.tsdf import undistorted_depth
+from slamdepth.mapping.undistorted import undistorted_depth
 from slamdepth.open3d_loader import import_open3d
 from slamdepth.types import Frame, Trajectory
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from slamdepth.frontend.metric import DescriptorMetric
     from slamdepth.frontend.preparation import Prepared
     from slamdepth.io import read_tum_trajectory, write_tum_trajectory
+    from slamdepth.mapping.cloud import PointCloud
     from slamdepth.mapping.keyframe import Keyframe
     from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
     from slamdepth.mapping.mesh import Mesh
@@ -73,6 +74,7 @@ _HOME = {
     "Keyframe": "slamdepth.mapping.keyframe",
     "Mesh": "slamdepth.mapping.mesh",
     "OutputError": "slamdepth.errors",
+    "PointCloud": "slamdepth.mapping.cloud",
     "Prepared": "slamdepth.frontend.preparation",
     "Reconstruction": "slamdepth.mapping.reconstruction",
     "RelativeError": "slamdepth.evaluation",
@@ -123,6 +125,7 @@ __all__ = [
     "Keyframe",
     "Mesh",
     "OutputError",
+    "PointCloud",
     "Prepared",
     "Reconstruction",
     "RelativeError",

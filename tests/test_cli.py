@@ -69,8 +69,8 @@ def test_a_run_says_first_whether_it_can_be_trusted(run_folder: Path, report: di
 
 def test_a_run_writes_everything_it_promises(run_folder: Path) -> None:
     promised = (
-        "trajectory_online.txt trajectory.txt keyframes.txt mesh.ply mesh.png report.json report.html "
-        "config.yaml log.txt README.txt"
+        "trajectory_online.txt trajectory.txt keyframes.txt mesh.ply cloud.ply mesh.png report.json "
+        "report.html config.yaml log.txt README.txt"
     )
     assert {path.name for path in run_folder.iterdir()} == {*promised.split(), "stdout.txt"}
     online, _ = read_tum_trajectory(run_folder / "trajectory_online.txt")
@@ -148,7 +148,14 @@ def test_the_same_command_gives_the_same_bytes(run_folder: Path, tiny_room: Path
         "run", tiny_room, "--config", config, "--max-frames", FRAMES, "--output", again, "--quiet"
     )
     assert done.returncode == 0, done.stderr
-    for name in ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "mesh.ply", "mesh.png"):
+    for name in (
+        "trajectory.txt",
+        "trajectory_online.txt",
+        "keyframes.txt",
+        "mesh.ply",
+        "cloud.ply",
+        "mesh.png",
+    ):
         assert (again / name).read_bytes() == (run_folder / name).read_bytes(), name
 
 

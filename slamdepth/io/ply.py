@@ -20,6 +20,8 @@ def encode_ply(
     colors: NDArray[np.uint8],
     triangles: NDArray[np.integer] | None = None,
     comments: Sequence[str] = (),
+    *,
+    normals: NDArray[np.floating] | None = None,
 ) -> bytes:
     """A little-endian binary PLY file.
 
@@ -28,22 +30,29 @@ def encode_ply(
         colors: ``(N, 3)`` uint8 RGB.
         triangles: ``(T, 3)`` numbers of points; None for a file of points alone.
         comments: lines of text for its header; what is not ASCII is escaped.
+        normals: ``(N, 3)``, stored as float32; None for a file without.
 
     Raises:
         ValueError: the shapes do not fit together, or a comment has a line break.
     """
     if points.shape != (len(points), 3) or colors.shape != points.shape:
         raise ValueError(f"points and colours must both be (N, 3), got {points.shape} and {colors.shape}")
+    if normals is not None and normals.shape != points.shape:
+        raise ValueError(f"normals must be {points.shape} as the points are, got {normals.shape}")
     if any("\n" in line or "\r" in line for line in comments):
         raise ValueError("a comment of a PLY file is one line")
-    vertices = np.empty(len(points), [("position", "<f4", 3), ("color", "u1", 3)])
+    parts = [("position", "<f4", 3), *([] if normals is None else [("normal", "<f4", 3)]), ("color", "u1", 3)]
+    vertices = np.empty(len(points), parts)
     vertices["position"], vertices["color"] = points, colors
+    if normals is not None:
+        vertices["normal"] = normals
     header = [
         "ply",
         "format binary_little_endian 1.0",
         *(f"comment {line}" for line in comments),
         f"element vertex {len(vertices)}",
         *(f"property float {axis}" for axis in "xyz"),
+        *(f"property float n{axis}" for axis in "xyz" if normals is not None),
         *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
     ]
     body = vertices.tobytes()

@@ -12,7 +12,7 @@ from slamdepth.geometry import invert, project, transform
 from slamdepth.mapping.fusion_depth import View, trusted_depth
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.mapping.tsdf import undistorted_depth
+from slamdepth.mapping.undistorted import undistorted_depth
 from slamdepth.robust import robust_deviation
 from slamdepth.typing import Bools, Floats, Floats32, Ints
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-_JUMP = 0.07
+JUMP = 0.07
 """Relative depth step between direct neighbours that marks both as flying pixels: on a surface
 seen with a 500 px focal length it would take an inclination of 88 degrees."""
 
@@ -60,7 +60,7 @@ def at_jumps(depth: Floats32) -> NDArray[np.bool_]:
         ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
     ):
         near = np.minimum(depth[a], depth[b])
-        step = (np.abs(depth[a] - depth[b]) > _JUMP * near) & (near > 0)
+        step = (np.abs(depth[a] - depth[b]) > JUMP * near) & (near > 0)
         jump[a] |= step
         jump[b] |= step
     return jump

@@ -51,12 +51,28 @@ class Mesh:
         none = np.zeros((0, 3), np.float32)
         return cls(none, np.zeros((0, 3), np.int32), none, notes)
 
+    def normals(self) -> NDArray[np.float32]:
+        """Unit normals ``(V, 3)`` of the vertices: those of the triangles at them, weighted by area.
+
+        They point outside; zero where no triangle has an area.
+        """
+        corners = self.vertices_m[self.triangles].astype(np.float64)
+        faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        count = len(self.vertices_m)
+        found = np.zeros((count, 3))
+        for axis in range(3):
+            for corner in self.triangles.T:
+                found[:, axis] += np.bincount(corner, faces[:, axis], count)
+        length = np.linalg.norm(found, axis=1, keepdims=True)
+        return np.asarray(np.divide(found, length, out=found, where=length > 0), np.float32)
+
     def save(self, path: str | Path) -> None:
         """Write the mesh as binary PLY, OBJ or GLB, by the ending of ``path``.
 
         The file is written whole or not at all. PLY and OBJ keep the world frame (y down when the first
         camera is level). GLB viewers expect y up, so its scene node turns the mesh by 180 degrees about x.
-        OBJ has the colours after the positions, as MeshLab and Open3D read them.
+        PLY has unit normals too, see :meth:`normals`. OBJ has the colours after the positions, as MeshLab
+        and Open3D read them.
 
         Raises:
             OutputError: the ending is none of these, or ``path`` cannot be written.
@@ -75,7 +91,7 @@ def _bytes_of(colors: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _ply(mesh: Mesh) -> bytes:
-    return encode_ply(mesh.vertices_m, _bytes_of(mesh.colors), mesh.triangles)
+    return encode_ply(mesh.vertices_m, _bytes_of(mesh.colors), mesh.triangles, normals=mesh.normals())
 
 
 def _obj(mesh: Mesh) -> bytes:

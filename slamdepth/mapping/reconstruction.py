@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from slamdepth.mapping.cloud import PointCloud
     from slamdepth.mapping.mesh import Mesh
 
 
@@ -74,3 +75,17 @@ class Reconstruction:
             "min_component_triangles": min_component_triangles,
         }
         return fuse_keyframes(self.keyframes, Config.from_dict({"map": settings}, "mesh").map, progress)
+
+    def measured_cloud(self, voxel_size_m: float = 0.01, *, max_depth_m: float = 4.0) -> PointCloud:
+        """The points that several views or a sensor measured, one in each voxel.
+
+        Args:
+            voxel_size_m: edge of a voxel in metres; enlarged, with a note, beyond four million points.
+            max_depth_m: depth beyond this is left out.
+
+        Returns:
+            Points in the world frame with normals and colours; none where a network alone gave depth.
+        """
+        from slamdepth.mapping.cloud import measured_cloud
+
+        return measured_cloud(self.keyframes, voxel_size_m, max_depth_m)

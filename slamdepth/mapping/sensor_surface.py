@@ -11,7 +11,8 @@ import numpy as np
 
 from slamdepth.geometry import backproject, invert
 from slamdepth.mapping.fusion_depth import View, at_jumps
-from slamdepth.mapping.tsdf import ordered, undistorted_depth
+from slamdepth.mapping.tsdf import ordered
+from slamdepth.mapping.undistorted import undistorted_depth
 from slamdepth.open3d_loader import import_open3d
 from slamdepth.types import Camera
 from slamdepth.typing import Bools, Floats, Floats32

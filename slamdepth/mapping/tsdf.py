@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from slamdepth.config import MapConfig
 from slamdepth.geometry import invert
+from slamdepth.mapping.dense_fusion import fuse_dense
 from slamdepth.mapping.fusion_depth import View, consistent_pixels, trusted_depth
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.mesh import Mesh
+from slamdepth.mapping.undistorted import undistorted_color, undistorted_depth
 from slamdepth.open3d_loader import import_open3d
-from slamdepth.types import Camera
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,6 +35,18 @@ _TRUNCATION_SENSOR = 4.0  # voxels
 _TRUNCATION_PREDICTED = 8.0  # voxels; wide enough for predictions to average out
 
 
+class _Fuse(Protocol):
+    def __call__(
+        self,
+        keyframes: Sequence[Keyframe],
+        settings: MapConfig,
+        voxel_m: float,
+        max_blocks: int,
+        least_views: int,
+        progress: Callable[[int, int], None] | None,
+    ) -> Any: ...
+
+
 def fuse_keyframes(
     keyframes: Sequence[Keyframe],
     settings: MapConfig,
@@ -42,8 +56,10 @@ def fuse_keyframes(
 ) -> Mesh:
     """Fuse the keyframes' depth and colour; returns the surface in the world frame.
 
-    Images and depth are undistorted here. Predicted depth has to pass two more tests than sensor depth: what
-    other keyframes contradict is dropped, and a surface must be seen by two keyframes.
+    Where keyframes have dense depth, that is fused, each pixel by its deviation, see
+    :class:`slamdepth.mapping.patches.Patches`. Else the depth they were given is; images and depth are
+    undistorted here, and predicted depth has to pass two more tests than sensor depth: what other keyframes
+    contradict is dropped, and a surface must be seen by two keyframes.
 
     Args:
         keyframes: optimised keyframes.
@@ -59,24 +75,23 @@ def fuse_keyframes(
     keyframes = [kf for kf in keyframes if np.isfinite(kf.T_world_camera).all()]
     if not keyframes:
         return Mesh.empty("no mesh: there are no keyframes")
-    keep = _consistent(keyframes, settings)
+    if any(keyframe.dense is not None for keyframe in keyframes):
+        fuse: _Fuse = fuse_dense
+    else:
+        fuse = partial(_fuse_given, keep=_consistent(keyframes, settings))
+    # few keyframes may have no second view
+    is_predicted = not any(keyframe.prediction.is_sensor for keyframe in keyframes)
+    least_views = 2 if is_predicted and len(keyframes) > 3 else 1
     notes: list[str] = []
     voxel_m = settings.voxel_size_m
-    while (grid := _integrated(keyframes, keep, settings, voxel_m, max_blocks, progress)) is None:
+    while (raw := fuse(keyframes, settings, voxel_m, max_blocks, least_views, progress)) is None:
         voxel_m *= _ENLARGE
         notes = [
             f"mesh: voxels enlarged from {settings.voxel_size_m:g} to {voxel_m:.3g} m to stay within memory"
         ]
         logger.info(notes[0])
-    if grid.hashmap().size() == 0:
-        return Mesh.empty(*notes, "no mesh: no keyframe has depth within the limits")
-
-    # few keyframes may have no second view
-    is_predicted = not any(keyframe.prediction.is_sensor for keyframe in keyframes)
-    least_views = 2 if is_predicted and len(keyframes) > 3 else 1
-    raw = grid.extract_triangle_mesh(least_views - 0.5)
     if "indices" not in raw.triangle or len(raw.triangle.indices) == 0:
-        return Mesh.empty(*notes, "no mesh: the fused depth holds no surface")
+        return Mesh.empty(*notes, "no mesh: no keyframe has depth within the limits that makes a surface")
     vertices, triangles, colors = _without_small_components(
         raw.vertex.positions.numpy(),
         raw.triangle.indices.numpy(),
@@ -110,15 +125,17 @@ def _consistent(keyframes: Sequence[Keyframe], settings: MapConfig) -> list[NDAr
     return keep
 
 
-def _integrated(
+def _fuse_given(
     keyframes: Sequence[Keyframe],
-    keep: Sequence[NDArray[np.bool_] | None],
     settings: MapConfig,
     voxel_m: float,
     max_blocks: int,
+    least_views: int,
     progress: Callable[[int, int], None] | None,
+    *,
+    keep: Sequence[NDArray[np.bool_] | None],
 ) -> Any:
-    """An Open3D ``VoxelBlockGrid`` of all keyframes, or None where it would need too many blocks."""
+    """The surface of the depth that keyframes were given, as :func:`fuse_dense` returns it."""
     o3d = import_open3d()
     float32 = o3d.core.float32
     grid = o3d.t.geometry.VoxelBlockGrid(
@@ -133,7 +150,7 @@ def _integrated(
             depth = np.where(_upsampled(mask, depth.shape), depth, np.float32(0.0))
         if depth.any():
             truncation = _TRUNCATION_SENSOR if keyframe.prediction.is_sensor else _TRUNCATION_PREDICTED
-            color = _undistorted_color(keyframe).astype(np.float32) / np.float32(255.0)
+            color = undistorted_color(keyframe).astype(np.float32) / np.float32(255.0)
             depth_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth)))
             color_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(color)))
             K = o3d.core.Tensor(camera.K)
@@ -150,37 +167,9 @@ def _integrated(
             )
         if progress is not None:
             progress(k + 1, len(keyframes))
-    return grid
-
-
-def undistorted_depth(depth_m: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
-    """Undistort depth ``(H, W)`` by nearest neighbour: a mean of two surfaces lies on neither."""
-    if not camera.is_distorted:
-        return depth_m
-    import cv2
-
-    x, y = _undistortion_maps(camera)
-    return np.asarray(cv2.remap(depth_m, x, y, cv2.INTER_NEAREST, borderValue=0), np.float32)
-
-
-def _undistorted_color(keyframe: Keyframe) -> NDArray[np.uint8]:
-    camera, image_rgb = keyframe.frame.camera, keyframe.frame.load().image_rgb
-    if not camera.is_distorted:
-        return image_rgb
-    import cv2
-
-    x, y = _undistortion_maps(camera)
-    image = cv2.remap(image_rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(image, np.uint8)
-
-
-def _undistortion_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    import cv2
-
-    x, y = cv2.initUndistortRectifyMap(
-        camera.K, camera.distortion_array, np.eye(3), camera.K, (camera.width, camera.height), cv2.CV_32FC1
-    )
-    return np.asarray(x, np.float32), np.asarray(y, np.float32)
+    if grid.hashmap().size() == 0:
+        return o3d.t.geometry.TriangleMesh()
+    return grid.extract_triangle_mesh(least_views - 0.5)
 
 
 def _upsampled(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:

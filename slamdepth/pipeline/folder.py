@@ -21,7 +21,8 @@ FILES = {
     "it was withdrawn later; a comment line says where another map, and so another world frame, begins",
     "keyframes.txt": "the keyframes of trajectory.txt",
     "depth_scale.yaml": "the scale fitted to the sequence's own sensor (--depth-scale groundtruth)",
-    "mesh.ply": "coloured mesh of the largest map in the frame of its first camera, metres",
+    "mesh.ply": "mesh of the largest map, with colours and normals, in the frame of its first camera, metres",
+    "cloud.ply": "points in the same frame that a sensor or several views measured, with colours and normals",
     "mesh.png": "the mesh as a whole with the camera's path, and over the camera's shoulder",
     "report.html": "figures and plots of the run; opens in any browser, needs nothing else",
     "report.json": "the same figures for programs",
@@ -35,12 +36,12 @@ MAPS = "maps/"
 """Folder of the maps that never met the largest one: ``maps/2/``, ``maps/3/``, ..."""
 
 MAPS_CONTENT = (
-    "2/, 3/, ...: trajectory.txt, keyframes.txt and mesh.ply of each map that never met the largest; every "
-    "map has its own world frame and its own scale"
+    "2/, 3/, ...: trajectory.txt, keyframes.txt, mesh.ply and cloud.ply of each map that never met the "
+    "largest; every map has its own world frame and its own scale"
 )
 """What :data:`MAPS` holds."""
 
-_MAP_FILES = ("trajectory.txt", "keyframes.txt", "mesh.ply")
+_MAP_FILES = ("trajectory.txt", "keyframes.txt", "mesh.ply", "cloud.ply")
 
 _README = "README.txt"
 _MARK = "A run of slamdepth"

@@ -17,7 +17,12 @@ from slamdepth.pipeline.dense import measure_depth
 from slamdepth.pipeline.folder import RunFolder
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
 from slamdepth.pipeline.prediction_scale import PredictionScale
-from slamdepth.pipeline.results import judge_trajectory, keyframe_trajectory, write_keyframe_mesh
+from slamdepth.pipeline.results import (
+    judge_trajectory,
+    keyframe_trajectory,
+    write_keyframe_mesh,
+    write_measured_cloud,
+)
 from slamdepth.pipeline.scale import scale_of_other
 from slamdepth.report import MapData, MeshCounts, MeshImage, write_mesh_png
 
@@ -58,7 +63,7 @@ def write_trajectories(folder: RunFolder, maps: Sequence[Reconstruction]) -> Non
 def write_mesh(
     folder: RunFolder, number: int, reconstruction: Reconstruction, config: Config, tell: ProgressCallback
 ) -> tuple[Mesh | None, tuple[MeshImage, ...], tuple[str, ...]]:
-    """Write the ``mesh.ply`` of one map, and the ``mesh.png`` of the largest.
+    """Write ``mesh.ply`` and ``cloud.ply`` of one map, and ``mesh.png`` of the largest.
 
     Args:
         number: of the map, 1 for the largest.
@@ -74,6 +79,7 @@ def write_mesh(
         mesh, images, notes = write_keyframe_mesh(
             reconstruction, config, place / "mesh.ply", tell, with_images=number == 1
         )
+        notes += write_measured_cloud(reconstruction, config, place / "cloud.ply")
     except SlamdepthError as error:
         notes = (f"no mesh: {error}",)
     notes = _of_map(number, notes)
@@ -97,7 +103,7 @@ def finish_others(
     """Mesh and score the maps that never met the largest one.
 
     Args:
-        mesh: write their ``mesh.ply``.
+        mesh: write their ``mesh.ply`` and ``cloud.ply``.
         is_measured: a sensor measured the depth.
 
     Returns:

@@ -24,7 +24,7 @@ class RunOptions:
         camera_file: a ``camera.yaml`` that overrules what the sequence says.
         max_frames: stop after this many frames; None reads all.
         stride: take every Nth frame.
-        mesh: fuse the keyframes and write ``mesh.ply``.
+        mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
 
     Raises:

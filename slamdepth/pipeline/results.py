@@ -84,6 +84,18 @@ def write_keyframe_mesh(
     return mesh, images, mesh.notes
 
 
+def write_measured_cloud(reconstruction: Reconstruction, config: Config, path: Path) -> tuple[str, ...]:
+    """Write the measured points, if there are any, two to the edge of a voxel of the mesh; returns notes.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+    """
+    cloud = reconstruction.measured_cloud(config.map.voxel_size_m / 2, max_depth_m=config.map.max_depth_m)
+    if len(cloud):
+        cloud.save(path)
+    return cloud.notes
+
+
 def judge_trajectory(
     dataset: Dataset, estimate: Trajectory, *, is_measured: bool = False
 ) -> tuple[TrajectoryScore | None, tuple[str, ...]]:

@@ -75,7 +75,7 @@ def run(
         config: every other setting, or a YAML file with settings. Default: ``Config()``.
         max_frames: stop after this many frames. Default: all.
         stride: take every Nth frame.
-        mesh: fuse the keyframes and write ``mesh.ply``.
+        mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
         progress: called after each frame and at the start of each stage.
         stop: set it, from any thread or a signal handler, to finish early with the frames tracked so far.
@@ -249,7 +249,12 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     )
     if mesh is not None and errors_m is not None:
         mesh_images += render_errors(mesh, errors_m, reconstruction)
-    optional = (("mesh.ply", mesh), ("mesh.png", mesh_images), ("depth_scale.yaml", scale.fit))
+    optional = (
+        ("mesh.ply", mesh),
+        ("cloud.ply", (folder / "cloud.ply").is_file()),
+        ("mesh.png", mesh_images),
+        ("depth_scale.yaml", scale.fit),
+    )
     absent = {name for name, is_there in optional if not is_there}
     files = {name: what for name, what in FILES.items() if name not in absent}
     tell(RunProgress(RunStage.REPORTING))
