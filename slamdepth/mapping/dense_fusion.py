@@ -21,7 +21,6 @@ def fuse_dense(
     settings: MapConfig,
     voxel_m: float,
     max_blocks: int,
-    least_views: int,
     progress: Callable[[int, int], None] | None,
 ) -> Any:
     """The surface of all keyframes that have dense depth, as Open3D's ``t.geometry.TriangleMesh``.
@@ -33,7 +32,6 @@ def fuse_dense(
         settings: depth limit.
         voxel_m: edge of a voxel.
         max_blocks: memory limit, in blocks of 8^3 voxels of 10 KB; those of this field have 13 KB.
-        least_views: that must have seen a surface; a pixel that several views measured counts for two.
         progress: called with (keyframes done, keyframes in all).
 
     Returns:
@@ -56,7 +54,7 @@ def fuse_dense(
             field.add(view)
         if progress is not None:
             progress(k + 1, len(keyframes))
-    return field.surface(least_views)
+    return field.surface()
 
 
 def _patches(keyframe: Keyframe, settings: MapConfig, voxel_m: float) -> Patches | None:

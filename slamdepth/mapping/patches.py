@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 _MOST_SIGMA = 0.1
 """Deviation of log depth from which a pixel is not fused: two layers at 2 m would be 20 cm apart."""
 
-_TRUNCATION_SIGMAS = 3.0
-_TRUNCATION_VOXELS = (3.0, 5.0)
 _LEAST_SIGMA_VOXELS = 0.5
-_LEAST_COSINE = 0.05
+_LEAST_COSINE = 0.2
+"""Cosine of incidence below which a pixel is not fused: depth at an edge is smeared over some pixels, and its
+slope there is steeper than of most surfaces that can be measured."""
+
 _COMPLETED = 0.01
 """Weight of a completed pixel, as part of a measured one of the same deviation."""
 
-_MEASURED_VOTES = 2  # two keyframes found it
 _WINDOW_PX = 15
 
 
@@ -40,8 +40,6 @@ class Patches:
         depth_m: ``(h, w)`` float32, 0 where there is nothing to fuse.
         normal: ``(h, w, 3)`` float32 unit normals in the camera's frame, away from the camera.
         weight: ``(h, w)`` float32; 1 for a measured pixel with a deviation of a voxel.
-        truncation_m: ``(h, w)`` float32 distance to the plane beyond which nothing more is told.
-        votes: ``(h, w)`` uint8 number of views that a pixel counts for.
         image_rgb: ``(h, w, 3)`` uint8.
         color_weight: ``(h, w)`` float32.
     """
@@ -51,8 +49,6 @@ class Patches:
     depth_m: Floats32
     normal: Floats32
     weight: Floats32
-    truncation_m: Floats32
-    votes: Bytes
     image_rgb: Bytes
     color_weight: Floats32
 
@@ -60,9 +56,9 @@ class Patches:
     def of(cls, dense: DenseDepth, T_world_camera: Floats, voxel_m: float, max_depth_m: float) -> Patches:
         """The planes of dense depth.
 
-        A pixel's weight is the inverse square of its deviation across its plane, in voxels; the truncation
-        is three deviations, from three to five voxels. Left out are depths beyond ``max_depth_m``, pixels at
-        depth jumps, very slanted ones, and those with a deviation of a tenth or more.
+        A pixel's weight is the inverse square of its deviation across its plane, in voxels. Left out are
+        depths beyond ``max_depth_m``, pixels at depth jumps, very slanted ones, and those with a deviation
+        of a tenth or more.
 
         The weight of a colour grows with the sharpness of the image, the cosine of incidence and closeness.
         """
@@ -72,7 +68,6 @@ class Patches:
         depth = np.where(drop | ~(dense.sigma_log < _MOST_SIGMA), np.float32(0.0), depth)
         sigma = dense.sigma_log * depth * cosine / np.float32(voxel_m)
         weight = 1.0 / (sigma**2 + np.float32(_LEAST_SIGMA_VOXELS**2))
-        truncation = np.clip(_TRUNCATION_SIGMAS * sigma, *_TRUNCATION_VOXELS) * np.float32(voxel_m)
         color = (cosine / np.maximum(depth, np.float32(0.1))) ** 2 * _sharpness(dense.image_rgb)
         return cls(
             dense.camera,
@@ -80,8 +75,6 @@ class Patches:
             depth,
             normal,
             np.where(dense.is_measured, weight, _COMPLETED * weight).astype(np.float32),
-            truncation.astype(np.float32),
-            np.where(dense.is_measured, _MEASURED_VOTES, 1).astype(np.uint8),
             dense.image_rgb,
             color.astype(np.float32),
         )

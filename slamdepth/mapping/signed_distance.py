@@ -2,8 +2,7 @@
 """A truncated signed distance field in sparse blocks, to which each pixel adds with a weight of its own.
 
 Curless and Levoy, "A volumetric method for building complex models from range images" (1996). Open3D gives
-all pixels the same weight and truncation; here its grid holds the sums, and its marching cubes extract the
-surface.
+all pixels the same weight; here its grid holds the sums, and its marching cubes extract the surface.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ BLOCK = 8
 _CELLS = BLOCK**3
 _CHUNK = 512  # blocks at a time, some 30 MB
 _NEAREST_M = 0.05
+_TRUNCATION = 3.0  # voxels
 _STEEPEST = 8.0  # distance along a ray in units of that to the plane, cos 83 degrees
 _STRIDE_PX = 2
 _AWAY = 1e-3  # weight of a colour far from its surface, in case there is no other
@@ -36,9 +36,9 @@ class SignedDistance:
     """Sums over views, in blocks of 8^3 voxels.
 
     A voxel's distance is the mean over views of its distance to the plane of the pixel that it projects to,
-    positive in front of it, at most the truncation of that pixel, weighted by the pixel. A view says nothing
-    of what lies farther behind its surface than that, and half as far behind it begins to count less, since
-    what it sees may be thin. All space in front of a surface counts, so a floating piece that others see
+    positive in front of it, at most three voxels, weighted by the pixel. A view says nothing of what lies
+    farther behind its surface than that, and half as far behind it begins to count less, since what it sees
+    may be thin. All space in front of a surface counts, so a floating piece that others see
     through is carved away.
 
     Args:
@@ -52,7 +52,7 @@ class SignedDistance:
     def __init__(self, voxel_m: float, blocks: NDArray[np.int32]) -> None:
         o3d = import_open3d()
         float32 = o3d.core.float32
-        self._voxel_m = voxel_m
+        self._voxel_m, self._truncation_m = voxel_m, _TRUNCATION * voxel_m
         self._grid = o3d.t.geometry.VoxelBlockGrid(
             ("tsdf", "weight", "color", "color_weight"), (float32,) * 4, ((1), (1), (3), (1)),
             voxel_m, BLOCK, max(len(blocks), 1), o3d.core.Device("CPU:0"),
@@ -67,7 +67,6 @@ class SignedDistance:
         )
         for sums in (self._distance, self._weight, self._color, self._color_weight):
             sums[...] = 0.0
-        self._votes = np.zeros(len(self._weight), np.uint8)
         z, y, x = np.mgrid[:BLOCK, :BLOCK, :BLOCK].reshape(3, -1)  # x runs fastest, as in Open3D
         self._cells_m = np.stack([x, y, z]) * voxel_m
 
@@ -90,9 +89,8 @@ class SignedDistance:
         x, y, z = centres.T
         ahead = np.maximum(z + radius, 1e-6)  # the widest cone that still holds a part of the block
         reach = radius * np.hypot(1.0, np.hypot(camera.width / camera.fx, camera.height / camera.fy))
-        inside = (z > _NEAREST_M - radius) & (
-            z < float((depth + _STEEPEST * view.truncation_m).max()) + radius
-        )
+        farthest = float(depth.max()) + _STEEPEST * self._truncation_m + radius
+        inside = (z > _NEAREST_M - radius) & (z < farthest)
         inside &= (x + reach) * camera.fx > -camera.cx * ahead
         inside &= (x - reach) * camera.fx < (camera.width - camera.cx) * ahead
         inside &= (y + reach) * camera.fy > -camera.cy * ahead
@@ -109,16 +107,16 @@ class SignedDistance:
         inside = (z > _NEAREST_M) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         kept = np.flatnonzero(inside)
         pixel = v[kept].astype(np.int64) * camera.width + u[kept].astype(np.int64)
-        depth, truncation = view.depth_m.ravel()[pixel], view.truncation_m.ravel()[pixel]
+        depth, truncation = view.depth_m.ravel()[pixel], np.float32(self._truncation_m)
         near = np.flatnonzero((depth > 0) & (z[kept] < depth + np.float32(_STEEPEST) * truncation))
-        kept, pixel, depth, truncation = kept[near], pixel[near], depth[near], truncation[near]
+        kept, pixel, depth = kept[near], pixel[near], depth[near]
         normal = view.normal.reshape(-1, 3)[pixel]
         row, column = np.divmod(pixel, camera.width)
         distance = normal[:, 0] * ((column.astype(np.float32) - cx) / fx * depth - x[kept])
         distance += normal[:, 1] * ((row.astype(np.float32) - cy) / fy * depth - y[kept])
         distance += normal[:, 2] * (depth - z[kept])
         near = np.flatnonzero(distance > -truncation)
-        cell, pixel, distance, truncation = cells[kept[near]], pixel[near], distance[near], truncation[near]
+        cell, pixel, distance = cells[kept[near]], pixel[near], distance[near]
         weight = view.weight.ravel()[pixel]
         weight *= np.clip(np.float32(2.0) + np.float32(2.0) * distance / truncation, 0.0, 1.0)
         self._distance[cell, 0] += weight * np.minimum(distance, truncation)
@@ -126,24 +124,19 @@ class SignedDistance:
 
         at_surface = np.flatnonzero(distance < truncation)
         cell, pixel, distance = cell[at_surface], pixel[at_surface], distance[at_surface]
-        votes = self._votes[cell].astype(np.int64) + view.votes.ravel()[pixel]
-        self._votes[cell] = np.minimum(votes, 255)
         closeness = np.exp(np.float32(-0.5) * (distance / np.float32(self._voxel_m)) ** 2) + np.float32(_AWAY)
         weight = view.color_weight.ravel()[pixel] * closeness
         self._color[cell] += weight[:, None] * view.image_rgb.reshape(-1, 3)[pixel]
         self._color_weight[cell, 0] += weight
 
-    def surface(self, least_votes: int) -> Any:
-        """The surface as Open3D's ``t.geometry.TriangleMesh``; the sums are used up.
-
-        Args:
-            least_votes: views that must have seen a voxel near a surface.
-        """
+    def surface(self) -> Any:
+        """The surface as Open3D's ``t.geometry.TriangleMesh``; the sums are used up."""
         if len(self._places) == 0:
             return import_open3d().t.geometry.TriangleMesh()
         np.divide(self._distance, self._weight * self._voxel_m, out=self._distance, where=self._weight > 0)
         np.divide(self._color, self._color_weight, out=self._color, where=self._color_weight > 0)  # to 255
-        self._weight[:, 0] = (self._votes >= least_votes) & (self._weight[:, 0] > 0)
+        # only views with a surface nearby gave a colour; space that is just empty is no part of one
+        self._weight[...] = (self._weight > 0) & (self._color_weight > 0)
         return self._grid.extract_triangle_mesh(0.5)
 
 
@@ -154,9 +147,8 @@ def blocks_of(view: Patches, voxel_m: float) -> NDArray[np.int32]:
     row, column = row * _STRIDE_PX, column * _STRIDE_PX
     z = view.depth_m[row, column].astype(np.float64)
     points = np.column_stack([(column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z, z])
-    reach = view.normal[row, column] * view.truncation_m[row, column, None]
-    longest = float(view.truncation_m[row, column].max(initial=0.0))
-    steps = max(2, 1 + int(np.ceil(4.0 * longest / edge_m)))
+    reach = view.normal[row, column] * (_TRUNCATION * voxel_m)
+    steps = 1 + int(np.ceil(4.0 * _TRUNCATION / BLOCK))  # of half a block
     R, t = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
     return union(
         [

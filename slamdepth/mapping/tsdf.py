@@ -42,7 +42,6 @@ class _Fuse(Protocol):
         settings: MapConfig,
         voxel_m: float,
         max_blocks: int,
-        least_views: int,
         progress: Callable[[int, int], None] | None,
     ) -> Any: ...
 
@@ -79,12 +78,9 @@ def fuse_keyframes(
         fuse: _Fuse = fuse_dense
     else:
         fuse = partial(_fuse_given, keep=_consistent(keyframes, settings))
-    # few keyframes may have no second view
-    is_predicted = not any(keyframe.prediction.is_sensor for keyframe in keyframes)
-    least_views = 2 if is_predicted and len(keyframes) > 3 else 1
     notes: list[str] = []
     voxel_m = settings.voxel_size_m
-    while (raw := fuse(keyframes, settings, voxel_m, max_blocks, least_views, progress)) is None:
+    while (raw := fuse(keyframes, settings, voxel_m, max_blocks, progress)) is None:
         voxel_m *= _ENLARGE
         notes = [
             f"mesh: voxels enlarged from {settings.voxel_size_m:g} to {voxel_m:.3g} m to stay within memory"
@@ -130,7 +126,6 @@ def _fuse_given(
     settings: MapConfig,
     voxel_m: float,
     max_blocks: int,
-    least_views: int,
     progress: Callable[[int, int], None] | None,
     *,
     keep: Sequence[NDArray[np.bool_] | None],
@@ -169,6 +164,9 @@ def _fuse_given(
             progress(k + 1, len(keyframes))
     if grid.hashmap().size() == 0:
         return o3d.t.geometry.TriangleMesh()
+    # few keyframes may have no second view
+    is_predicted = not any(keyframe.prediction.is_sensor for keyframe in keyframes)
+    least_views = 2 if is_predicted and len(keyframes) > 3 else 1
     return grid.extract_triangle_mesh(least_views - 0.5)
 
 
