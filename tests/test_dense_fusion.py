@@ -173,18 +173,16 @@ def test_an_edge_that_is_smeared_over_some_pixels_is_not_bridged() -> None:
     assert (z > 1.99).sum() > 1000
 
 
-def test_unsure_slanted_and_far_pixels_are_left_out() -> None:
+def test_unsure_and_far_pixels_are_left_out() -> None:
     depth = wall()
     depth[:10] = 5.0
     depth[0, 0] = np.nan
     sigma = np.full(SHAPE, 0.01, np.float32)
     sigma[20:30] = 0.2
-    depth[40:, 100:110] = 2.0 + 0.12 * np.arange(1, 11)
     view = Patches.of(dense(depth, sigma), np.eye(4), VOXEL_M, 4.0)
     assert not view.depth_m[:10].any()
     assert not view.depth_m[20:30].any()
-    assert not view.depth_m[45:115, 102:108].any()
-    assert (view.depth_m[40:, :90] == 2.0).all()
+    assert (view.depth_m[40:] == 2.0).all()
     assert np.isnan(depth[0, 0])  # arguments stay as they are
 
 
@@ -193,8 +191,8 @@ def test_the_weight_follows_the_deviation() -> None:
     sigma[60:] = 0.05
     view = Patches.of(dense(wall(), sigma), np.eye(4), VOXEL_M, 4.0)
     sure, unsure = view.weight[59, 80], view.weight[60, 80]
-    assert sure == pytest.approx(1.0 / (1.0 + 0.25), rel=1e-3)  # a deviation of a voxel
-    assert unsure == pytest.approx(1.0 / (25.0 + 0.25), rel=1e-2)
+    assert sure == pytest.approx(1.0 / (1.0 + 1.0), rel=1e-3)  # a deviation of a voxel
+    assert unsure == pytest.approx(1.0 / (25.0 + 1.0), rel=1e-2)
     guess = Patches.of(dense(wall(), sigma, False), np.eye(4), VOXEL_M, 4.0)
     np.testing.assert_allclose(guess.weight, 0.01 * view.weight, rtol=1e-5)
 

@@ -19,11 +19,7 @@ if TYPE_CHECKING:
 _MOST_SIGMA = 0.1
 """Deviation of log depth from which a pixel is not fused: two layers at 2 m would be 20 cm apart."""
 
-_LEAST_SIGMA_VOXELS = 0.5
-_LEAST_COSINE = 0.2
-"""Cosine of incidence below which a pixel is not fused: depth at an edge is smeared over some pixels, and its
-slope there is steeper than of most surfaces that can be measured."""
-
+_LEAST_SIGMA_VOXELS = 1.0
 _COMPLETED = 0.01
 """Weight of a completed pixel, as part of a measured one of the same deviation."""
 
@@ -39,7 +35,7 @@ class Patches:
         T_world_camera: ``(4, 4)``.
         depth_m: ``(h, w)`` float32, 0 where there is nothing to fuse.
         normal: ``(h, w, 3)`` float32 unit normals in the camera's frame, away from the camera.
-        weight: ``(h, w)`` float32; 1 for a measured pixel with a deviation of a voxel.
+        weight: ``(h, w)`` float32; 1 for a measured pixel that is exact.
         image_rgb: ``(h, w, 3)`` uint8.
         color_weight: ``(h, w)`` float32.
     """
@@ -56,17 +52,16 @@ class Patches:
     def of(cls, dense: DenseDepth, T_world_camera: Floats, voxel_m: float, max_depth_m: float) -> Patches:
         """The planes of dense depth.
 
-        A pixel's weight is the inverse square of its deviation across its plane, in voxels. Left out are
-        depths beyond ``max_depth_m``, pixels at depth jumps, very slanted ones, and those with a deviation
-        of a tenth or more.
+        A pixel's weight is the inverse square of its deviation in voxels. Left out are depths beyond
+        ``max_depth_m``, pixels at depth jumps, and those with a deviation of a tenth or more.
 
         The weight of a colour grows with the sharpness of the image, the cosine of incidence and closeness.
         """
         depth = np.where(np.isfinite(dense.depth_m), dense.depth_m, np.float32(0.0))
         normal, cosine = planes(depth, dense.camera)
-        drop = (depth <= 0) | (depth > max_depth_m) | at_jumps(depth) | (cosine < _LEAST_COSINE)
+        drop = (depth <= 0) | (depth > max_depth_m) | at_jumps(depth)
         depth = np.where(drop | ~(dense.sigma_log < _MOST_SIGMA), np.float32(0.0), depth)
-        sigma = dense.sigma_log * depth * cosine / np.float32(voxel_m)
+        sigma = dense.sigma_log * depth / np.float32(voxel_m)
         weight = 1.0 / (sigma**2 + np.float32(_LEAST_SIGMA_VOXELS**2))
         color = (cosine / np.maximum(depth, np.float32(0.1))) ** 2 * _sharpness(dense.image_rgb)
         return cls(

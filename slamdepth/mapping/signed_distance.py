@@ -27,7 +27,8 @@ _CELLS = BLOCK**3
 _CHUNK = 512  # blocks at a time, some 30 MB
 _NEAREST_M = 0.05
 _TRUNCATION = 3.0  # voxels
-_STEEPEST = 8.0  # distance along a ray in units of that to the plane, cos 83 degrees
+_WITHIN_PIXEL = 0.1  # most relative change of depth within a pixel
+_LEAST_COSINE = 0.02
 _STRIDE_PX = 2
 _AWAY = 1e-3  # weight of a colour far from its surface, in case there is no other
 
@@ -35,11 +36,14 @@ _AWAY = 1e-3  # weight of a colour far from its surface, in case there is no oth
 class SignedDistance:
     """Sums over views, in blocks of 8^3 voxels.
 
-    A voxel's distance is the mean over views of its distance to the plane of the pixel that it projects to,
-    positive in front of it, at most three voxels, weighted by the pixel. A view says nothing of what lies
-    farther behind its surface than that, and half as far behind it begins to count less, since what it sees
-    may be thin. All space in front of a surface counts, so a floating piece that others see
-    through is carved away.
+    A voxel's distance is the mean over views of how far it is in front of the plane of the pixel that it
+    projects to, along z of the camera, at most three voxels, weighted by the pixel. A view says nothing of
+    what lies farther behind its surface than that, and half as far behind it begins to count less, since what
+    it sees may be thin. All space in front of a surface counts, so a floating piece that others see through
+    is carved away.
+
+    A slope of some five voxels of depth to one across, as depth is smeared to at an edge, leaves no surface:
+    of two neighbouring voxels one is too far before it or behind it.
 
     Args:
         voxel_m: edge of a voxel.
@@ -89,7 +93,7 @@ class SignedDistance:
         x, y, z = centres.T
         ahead = np.maximum(z + radius, 1e-6)  # the widest cone that still holds a part of the block
         reach = radius * np.hypot(1.0, np.hypot(camera.width / camera.fx, camera.height / camera.fy))
-        farthest = float(depth.max()) + _STEEPEST * self._truncation_m + radius
+        farthest = (1.0 + _WITHIN_PIXEL) * float(depth.max()) + self._truncation_m + radius
         inside = (z > _NEAREST_M - radius) & (z < farthest)
         inside &= (x + reach) * camera.fx > -camera.cx * ahead
         inside &= (x - reach) * camera.fx < (camera.width - camera.cx) * ahead
@@ -108,13 +112,16 @@ class SignedDistance:
         kept = np.flatnonzero(inside)
         pixel = v[kept].astype(np.int64) * camera.width + u[kept].astype(np.int64)
         depth, truncation = view.depth_m.ravel()[pixel], np.float32(self._truncation_m)
-        near = np.flatnonzero((depth > 0) & (z[kept] < depth + np.float32(_STEEPEST) * truncation))
+        near = np.flatnonzero((depth > 0) & (z[kept] < np.float32(1.0 + _WITHIN_PIXEL) * depth + truncation))
         kept, pixel, depth = kept[near], pixel[near], depth[near]
-        normal = view.normal.reshape(-1, 3)[pixel]
+        # where the voxel's ray meets the plane of the pixel
+        normal = view.normal.reshape(-1, 3)[pixel].T
         row, column = np.divmod(pixel, camera.width)
-        distance = normal[:, 0] * ((column.astype(np.float32) - cx) / fx * depth - x[kept])
-        distance += normal[:, 1] * ((row.astype(np.float32) - cy) / fy * depth - y[kept])
-        distance += normal[:, 2] * (depth - z[kept])
+        ray = x[kept] / z[kept], y[kept] / z[kept]
+        of_pixel = (column.astype(np.float32) - cx) / fx, (row.astype(np.float32) - cy) / fy
+        to_plane = depth * (normal[0] * of_pixel[0] + normal[1] * of_pixel[1] + normal[2])
+        cosine = normal[0] * ray[0] + normal[1] * ray[1] + normal[2]
+        distance = to_plane / np.maximum(cosine, np.float32(_LEAST_COSINE)) - z[kept]
         near = np.flatnonzero(distance > -truncation)
         cell, pixel, distance = cells[kept[near]], pixel[near], distance[near]
         weight = view.weight.ravel()[pixel]
@@ -147,7 +154,7 @@ def blocks_of(view: Patches, voxel_m: float) -> NDArray[np.int32]:
     row, column = row * _STRIDE_PX, column * _STRIDE_PX
     z = view.depth_m[row, column].astype(np.float64)
     points = np.column_stack([(column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z, z])
-    reach = view.normal[row, column] * (_TRUNCATION * voxel_m)
+    reach = points / z[:, None] * (_TRUNCATION * voxel_m)
     steps = 1 + int(np.ceil(4.0 * _TRUNCATION / BLOCK))  # of half a block
     R, t = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
     return union(
