@@ -63,7 +63,7 @@ _REAL = {"kitchen": "7scenes_redkitchen_seq-01", "rpy": "rgbd_dataset_freiburg1_
 _KEYS = ("sequence", "row")
 _HEADINGS = ("sequence", "row", "accuracy, median / RMSE cm", "completion, median / RMSE cm",
              "precision / recall at 5 cm", "F at 2 / 5 / 10 cm", "F at 5 cm, SE(3) / Sim(3)",
-             "AbsRel / median", "edges F1", "1 / 2 sigma", "s")  # fmt: skip
+             "AbsRel / median", "measured: share, median", "edges F1", "1 / 2 sigma", "s")  # fmt: skip
 
 
 def dense_modes() -> tuple[str, ...]:
@@ -125,7 +125,7 @@ class Bench:
         row["sim3"] = None if scores is None else scores.sim3.to_dict()
         row["depth"] = None
         if made.keyframes is not None:
-            row["depth"] = score_keyframes(self.dataset, made.keyframes.keyframes, alignment.scale)
+            row["depth"] = score_keyframes(self.dataset, made.keyframes, alignment.scale)
         return row
 
     @property
@@ -200,11 +200,14 @@ def _cells(row: dict[str, Any]) -> list[str]:
         ]
     depth = row["depth"]
     if depth is None:
-        cells += ["-", "-", "-"]
+        cells += ["-", "-", "-", "-"]
     else:
         inside = "-" if depth["within_1_sigma"] is None else (
             f"{100 * depth['within_1_sigma']:.0f} / {100 * depth['within_2_sigma']:.0f} %")  # fmt: skip
-        cells += [f"{depth['abs_rel']:.3f} / {depth['median']:.3f}", f"{depth['edge_f1']:.2f}", inside]
+        measured = "-" if depth["median_measured"] is None else (
+            f"{100 * depth['measured']:.0f} %, {depth['median_measured']:.3f}")  # fmt: skip
+        errors = f"{depth['abs_rel']:.3f} / {depth['median']:.3f}"
+        cells += [errors, measured, f"{depth['edge_f1']:.2f}", inside]
     return [*cells, f"{row['seconds']:.0f}"]
 
 

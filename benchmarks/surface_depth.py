@@ -19,8 +19,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.datasets import Dataset
+from slamdepth.dense.frames import FrameViews
+from slamdepth.dense.rectify import Rectifier
 from slamdepth.errors import ImageDecodeError
 from slamdepth.mapping.keyframe import Keyframe
+from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.types import DepthKind, DepthPrediction
 from slamdepth.typing import Bools, Floats32
 
@@ -84,50 +87,88 @@ def _grown(mask: Bools) -> Bools:
 
 
 def score_keyframes(
-    dataset: Dataset, keyframes: Sequence[Keyframe], scale: float
+    dataset: Dataset, reconstruction: Reconstruction, scale: float
 ) -> dict[str, float | int | None] | None:
     """Figures of the keyframes' final depth, multiplied by ``scale``; None without sensor depth.
 
     Returns:
         ``abs_rel`` and ``median``, mean and median relative error of all pixels with both depths;
-        ``within_5``, the share within 5 %; ``edge_f1``; ``within_1_sigma`` and ``within_2_sigma``, shares of
-        the pixels whose error of log depth is within the stated deviation, None where none is stated;
+        ``measured``, the share of the pixels that several views measured, and ``median_measured``, the median
+        relative error there, None without dense depth; ``within_5``, the share within 5 %; ``edge_f1``;
+        ``within_1_sigma`` and ``within_2_sigma``, shares of the pixels whose error of log depth is within the
+        stated deviation, None where none is stated;
         ``keyframes``, their number.
     """
     errors: list[NDArray[np.float32]] = []
     whitened: list[NDArray[np.float32]] = []
+    measured: list[NDArray[np.bool_]] = []
     edges, used = EdgeCounts(), 0
-    for keyframe in keyframes:
+    for keyframe in reconstruction.keyframes:
         try:
             truth_m = dataset.read(keyframe.frame.index, with_depth=True).depth_m
         except ImageDecodeError:
             continue
         if truth_m is None:
             continue
-        depth_m = np.nan_to_num(keyframe.load_depth_m()) * np.float32(scale)
+        final = _final_depth(reconstruction, keyframe, truth_m)
+        depth_m, truth_m = final.depth_m * np.float32(scale), final.truth_m
         edges.add(depth_m, truth_m)
-        some = (slice(_STRIDE // 2, None, _STRIDE),) * 2
+        stride = max(1, _STRIDE * depth_m.shape[1] // dataset.camera.width)
+        some = (slice(stride // 2, None, stride),) * 2
         ours, truth = depth_m[some], truth_m[some]
         known = (ours > 0) & (truth > 0)
         ratio = ours[known] / truth[known]
         errors.append(np.abs(ratio - 1))
-        sigma_log = keyframe.prediction.load().sigma_log
-        if sigma_log is not None:
-            whitened.append(np.abs(np.log(ratio)) / np.maximum(sigma_log[some][known], np.float32(1e-6)))
+        if final.sigma_log is not None:
+            sigma_log = final.sigma_log[some][known]
+            whitened.append(np.abs(np.log(ratio)) / np.maximum(sigma_log, np.float32(1e-6)))
+        if final.is_measured is not None:
+            measured.append(final.is_measured[some][known])
         used += 1
     if not used or not sum(map(len, errors)):
         return None
     error = np.concatenate(errors)
     inside = np.concatenate(whitened) if whitened else None
+    chosen = np.concatenate(measured) if len(measured) == used else None
     return {
         "abs_rel": float(error.mean()),
         "median": float(np.median(error)),
+        "measured": None if chosen is None else float(chosen.mean()),
+        "median_measured": None if chosen is None or not chosen.any() else float(np.median(error[chosen])),
         "within_5": float((error <= 0.05).mean()),
         "edge_f1": edges.f1,
         "within_1_sigma": None if inside is None else float((inside <= 1).mean()),
         "within_2_sigma": None if inside is None else float((inside <= 2).mean()),
         "keyframes": used,
     }
+
+
+@dataclass(frozen=True)
+class _FinalDepth:
+    """Depth of a keyframe and the true one at the same pixels ``(h, w)``, with what is stated of it."""
+
+    depth_m: Floats32
+    truth_m: Floats32
+    sigma_log: Floats32 | None
+    is_measured: Bools | None = None
+
+
+def _final_depth(reconstruction: Reconstruction, keyframe: Keyframe, truth_m: Floats32) -> _FinalDepth:
+    if keyframe.dense is None:
+        depth_m = np.nan_to_num(keyframe.load_depth_m())
+        return _FinalDepth(depth_m, truth_m, keyframe.prediction.load().sigma_log)
+    dense, trajectory = keyframe.dense.load(), reconstruction.trajectory
+    rectifier = Rectifier.of(
+        keyframe.frame.camera,
+        max(dense.camera.width, dense.camera.height),
+        reconstruction.statistics.readout_s or 0.0,
+    )
+    row = int(np.searchsorted(trajectory.timestamps_s, keyframe.frame.timestamp_s))
+    inverse_depth = 1.0 / float(np.median(dense.depth_m))
+    positions = FrameViews(trajectory, lambda row: None, rectifier, inverse_depth).positions(row)
+    return _FinalDepth(
+        dense.depth_m, rectifier.nearest(truth_m, positions), dense.sigma_log, dense.is_measured
+    )
 
 
 def scaled_predictions(keyframes: Sequence[Keyframe]) -> tuple[Keyframe, ...]:

@@ -14,7 +14,7 @@ from slamdepth._version import __version__
 if TYPE_CHECKING:
     from slamdepth.config import Config
     from slamdepth.datasets import Dataset, open_dataset
-    from slamdepth.dense import densify
+    from slamdepth.dense import DenseEffort, densify
     from slamdepth.depth.base import DepthModel
     from slamdepth.depth.registry import create_depth_model
     from slamdepth.errors import (
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from slamdepth.frontend.preparation import Prepared
     from slamdepth.io import read_tum_trajectory, write_tum_trajectory
     from slamdepth.mapping.cloud import PointCloud
+    from slamdepth.mapping.dense_depth import DenseDepth, StoredDenseDepth
     from slamdepth.mapping.keyframe import Keyframe
     from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
     from slamdepth.mapping.mesh import Mesh
@@ -62,6 +63,8 @@ _HOME = {
     "ConfigError": "slamdepth.errors",
     "Dataset": "slamdepth.datasets",
     "DatasetError": "slamdepth.errors",
+    "DenseDepth": "slamdepth.mapping.dense_depth",
+    "DenseEffort": "slamdepth.dense",
     "DepthKind": "slamdepth.types",
     "DescriptorMetric": "slamdepth.frontend.metric",
     "DepthModel": "slamdepth.depth.base",
@@ -85,6 +88,7 @@ _HOME = {
     "RunStatistics": "slamdepth.types",
     "SlamdepthError": "slamdepth.errors",
     "StepResult": "slamdepth.types",
+    "StoredDenseDepth": "slamdepth.mapping.dense_depth",
     "StoredFrame": "slamdepth.mapping.keyframe_store",
     "StoredPrediction": "slamdepth.mapping.keyframe_store",
     "Tracker": "slamdepth.tracking",
@@ -113,6 +117,8 @@ __all__ = [
     "ConfigError",
     "Dataset",
     "DatasetError",
+    "DenseDepth",
+    "DenseEffort",
     "DepthKind",
     "DepthModel",
     "DepthPrediction",
@@ -136,6 +142,7 @@ __all__ = [
     "RunStatistics",
     "SlamdepthError",
     "StepResult",
+    "StoredDenseDepth",
     "StoredFrame",
     "StoredPrediction",
     "Tracker",

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,12 @@ import pytest
 from benchmarks import surface
 from benchmarks.surface_depth import EdgeCounts, depth_edges, scaled_predictions, score_keyframes
 from slamdepth.datasets import open_dataset
+from slamdepth.mapping.dense_depth import DenseDepth, store_dense_depth
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
-from slamdepth.types import DepthKind, DepthPrediction
+from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.mapping.spill_file import SpillFile
+from slamdepth.types import DepthKind, DepthPrediction, Trajectory
 from slamdepth.typing import Floats32
 
 
@@ -75,18 +79,49 @@ def keyframes_of(room: Path, factor: float, sigma_log: float) -> list[Keyframe]:
     return found
 
 
+PATH = Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)))
+
+
 def test_depth_of_keyframes_is_scored_against_the_sensor(tiny_room: Path) -> None:
     room = open_dataset(tiny_room)
-    scored = score_keyframes(room, keyframes_of(tiny_room, 1.1, 0.06), 1.0)
+    scored = score_keyframes(
+        room, Reconstruction(PATH, tuple(keyframes_of(tiny_room, 1.1, 0.06)), np.zeros((0, 3))), 1.0
+    )
     assert scored is not None
     assert scored["abs_rel"] == pytest.approx(0.1, abs=1e-3)
     assert scored["median"] == pytest.approx(0.1, abs=1e-3)
     assert (scored["within_5"], scored["within_1_sigma"], scored["within_2_sigma"]) == (0.0, 0.0, 1.0)
     assert scored["edge_f1"] == 1.0
     assert scored["keyframes"] == 2
-    exact = score_keyframes(room, keyframes_of(tiny_room, 1.1, 0.06), 1 / 1.1)
+    assert scored["measured"] is None
+    exact = score_keyframes(
+        room, Reconstruction(PATH, tuple(keyframes_of(tiny_room, 1.1, 0.06)), np.zeros((0, 3))), 1 / 1.1
+    )
     assert exact is not None
     assert exact["abs_rel"] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_dense_depth_is_scored_at_its_own_pixels(tiny_room: Path) -> None:
+    room, keyframes = open_dataset(tiny_room), keyframes_of(tiny_room, 1.1, 0.06)
+    camera = room.camera.scaled(room.camera.width // 2, room.camera.height // 2)
+    for n, keyframe in enumerate(keyframes):
+        truth_m = keyframe.frame.load().depth_m
+        assert truth_m is not None
+        depth_m = truth_m[1::2, 1::2] * np.float32(1.02)  # where a pixel of half the size is looked up
+        image = np.zeros((*depth_m.shape, 3), np.uint8)
+        sigma, measured = np.full_like(depth_m, 0.03), np.zeros(depth_m.shape, np.bool_)
+        measured[:, : depth_m.shape[1] // 2] = True
+        dense = DenseDepth(camera, image, depth_m, sigma, measured)
+        keyframes[n] = replace(keyframe, dense=store_dense_depth(dense, SpillFile()))
+    times_s = np.array([keyframe.frame.timestamp_s for keyframe in keyframes])
+    path = Trajectory(times_s, np.tile(np.eye(4), (2, 1, 1)))
+    scored = score_keyframes(room, Reconstruction(path, tuple(keyframes), np.zeros((0, 3))), 1.0)
+    assert scored is not None
+    assert scored["median"] == pytest.approx(0.02, abs=5e-3)
+    assert scored["median_measured"] == pytest.approx(0.02, abs=5e-3)
+    assert scored["measured"] == pytest.approx(0.5, abs=0.05)
+    assert scored["within_1_sigma"] is not None
+    assert scored["within_1_sigma"] > 0.8
 
 
 def test_the_network_alone_is_its_prediction_times_a_factor(tiny_room: Path) -> None:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slamdepth.dense import EFFORTS, Effort, densify
+from slamdepth.dense import EFFORTS, DenseEffort, densify
 from slamdepth.errors import ConfigError
 from slamdepth.mapping.dense_depth import DenseDepth
 from slamdepth.mapping.reconstruction import Reconstruction
 
-EFFORT = Effort(160, 6, ((0.4, 33),))
+EFFORT = DenseEffort(160, 6, ((0.4, 33),))
 
 
 def _dense(reconstruction: Reconstruction) -> list[DenseDepth]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from slamdepth.config import MapConfig
 from slamdepth.geometry import se3_exp
 from slamdepth.mapping.cloud import measured_cloud
-from slamdepth.mapping.dense_depth import DenseDepth, StoredDenseDepth
+from slamdepth.mapping.dense_depth import DenseDepth, store_dense_depth
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.mesh import Mesh
@@ -79,7 +79,7 @@ def keyframe(
         1.0,
         StoredPrediction(prediction),
         lambda one: one.values,
-        dense=None if depth is None else StoredDenseDepth.of(depth, SpillFile()),
+        dense=None if depth is None else store_dense_depth(depth, SpillFile()),
     )
 
 

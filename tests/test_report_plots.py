@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 from report_data import CAMERA, bare_data, full_data, keyframe
 
-from slamdepth.mapping.dense_depth import DenseDepth, StoredDenseDepth
+from slamdepth.mapping.dense_depth import DenseDepth, store_dense_depth
 from slamdepth.mapping.spill_file import SpillFile
 from slamdepth.report import (
     build_html,
@@ -130,7 +130,7 @@ def test_the_gallery_spreads_over_the_run_and_shows_the_sensor_next_to_a_predict
     depth = np.full((12, 16), 2.0, np.float32)
     image = np.zeros((12, 16, 3), np.uint8)
     dense = DenseDepth(CAMERA.scaled(16, 12), image, depth, depth, np.ones((12, 16), np.bool_))
-    measured = keyframe_gallery((replace(keyframe(0), dense=StoredDenseDepth.of(dense, SpillFile())),))
+    measured = keyframe_gallery((replace(keyframe(0), dense=store_dense_depth(dense, SpillFile())),))
     assert measured is not None
     assert "depth from many views" in measured.keyframes[0].images
     unknown = replace(keyframe(0), in_metres=lambda prediction: np.zeros_like(prediction.values))

@@ -7,6 +7,6 @@ agree (plane sweep, Collins 1996, with the prediction in place of planes), smoot
 (Hirschmueller 2008), kept where other keyframes find the same surface, and completed by the prediction.
 """
 
-from slamdepth.dense.reconstruct import EFFORTS, Effort, densify
+from slamdepth.dense.reconstruct import EFFORTS, DenseEffort, densify
 
-__all__ = ["EFFORTS", "Effort", "densify"]
+__all__ = ["EFFORTS", "DenseEffort", "densify"]

@@ -23,7 +23,7 @@ from slamdepth.dense.sheet import first_sheet
 from slamdepth.dense.views import are_seen, choose_views, surface_points
 from slamdepth.errors import ConfigError, ImageDecodeError
 from slamdepth.mapping.codec import encode_half_precision
-from slamdepth.mapping.dense_depth import DenseDepth, StoredDenseDepth
+from slamdepth.mapping.dense_depth import DenseDepth, StoredDenseDepth, store_dense_depth
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapping.spill_file import SpilledArray, SpillFile
@@ -42,7 +42,7 @@ _LEAST_OVERLAP = 0.25
 
 
 @dataclass(frozen=True)
-class Effort:
+class DenseEffort:
     """How much is computed for a keyframe.
 
     Attributes:
@@ -57,15 +57,15 @@ class Effort:
 
 
 EFFORTS = {
-    "fast": Effort(320, 6, ((0.42, 33),)),
-    "best": Effort(480, 8, ((0.42, 49), (0.1, 21))),
+    "fast": DenseEffort(320, 6, ((0.42, 33),)),
+    "best": DenseEffort(480, 8, ((0.42, 49), (0.1, 21))),
 }
 
 
 def densify(
     reconstruction: Reconstruction,
     dataset: Dataset | None = None,
-    effort: Effort | str = "fast",
+    effort: DenseEffort | str = "fast",
     progress: Callable[[int, int], None] | None = None,
 ) -> Reconstruction:
     """Measure the depth of each keyframe from the frames about it.
@@ -115,7 +115,7 @@ class _Job:
         self,
         reconstruction: Reconstruction,
         dataset: Dataset | None,
-        effort: Effort,
+        effort: DenseEffort,
         progress: Callable[[int, int], None],
     ) -> None:
         trajectory = reconstruction.trajectory
@@ -218,7 +218,7 @@ class _Job:
         self._put(state, present=fused.complete_m)
         color = self._rectifier.color(image_rgb, self._views.positions(state.row))
         depth = DenseDepth(self._camera, color, fused.depth_m, fused.sigma_log, fused.is_measured)
-        return StoredDenseDepth.of(depth, self._file)
+        return store_dense_depth(depth, self._file)
 
 
 class _Images:

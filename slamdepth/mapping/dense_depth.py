@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slamdepth.mapping.codec import encode_half_precision, encode_image
-from slamdepth.mapping.spill_file import SpilledArray, SpillFile
 from slamdepth.types import Camera
 
 if TYPE_CHECKING:
+    from slamdepth.mapping.spill_file import SpilledArray, SpillFile
     from slamdepth.typing import Bools, Bytes, Floats32
 
 
@@ -52,18 +52,6 @@ class StoredDenseDepth:
     _sigma: SpilledArray
     unit: float = 1.0
 
-    @classmethod
-    def of(cls, depth: DenseDepth, file: SpillFile) -> StoredDenseDepth:
-        """Write dense depth to ``file``, depth and deviation to three digits, colours as a JPEG."""
-        sigma = np.where(depth.is_measured, depth.sigma_log, -depth.sigma_log)
-        return cls(
-            depth.camera,
-            float(depth.is_measured.mean()),
-            file.spill(encode_image(depth.image_rgb)),
-            file.spill(encode_half_precision(depth.depth_m)),
-            file.spill(encode_half_precision(sigma.astype(np.float32))),
-        )
-
     def load(self) -> DenseDepth:
         """The dense depth, read from the file each time."""
         signed = self._sigma.load()
@@ -73,3 +61,15 @@ class StoredDenseDepth:
     def rescaled(self, factor: float) -> StoredDenseDepth:
         """The same depth in a map whose lengths are multiplied by ``factor``."""
         return replace(self, unit=self.unit * factor)
+
+
+def store_dense_depth(depth: DenseDepth, file: SpillFile) -> StoredDenseDepth:
+    """Write dense depth to ``file``, depth and deviation to three digits, colours as a JPEG."""
+    sigma = np.where(depth.is_measured, depth.sigma_log, -depth.sigma_log)
+    return StoredDenseDepth(
+        depth.camera,
+        float(depth.is_measured.mean()),
+        file.spill(encode_image(depth.image_rgb)),
+        file.spill(encode_half_precision(depth.depth_m)),
+        file.spill(encode_half_precision(sigma.astype(np.float32))),
+    )
