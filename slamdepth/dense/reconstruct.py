@@ -90,8 +90,12 @@ def densify(
     if len(reconstruction.keyframes) < 2:
         return reconstruction
     job = _Job(reconstruction, dataset, effort, progress or (lambda done, total: None))
-    with single_threaded(), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        depths = job.run(pool)
+    pool = ThreadPoolExecutor(os.cpu_count() or 1)
+    try:
+        with single_threaded():
+            depths = job.run(pool)
+    finally:
+        pool.shutdown(cancel_futures=True)  # an interrupted job does not finish what waits
     return replace(
         reconstruction,
         keyframes=tuple(replace(kf, dense=depths.get(kf.id)) for kf in reconstruction.keyframes),
