@@ -14,6 +14,7 @@ from slamdepth.dense import EFFORTS, DenseEffort, densify
 from slamdepth.errors import ConfigError
 from slamdepth.mapping.dense_depth import DenseDepth
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.types import Trajectory
 
 EFFORT = DenseEffort(160, 6, ((0.4, 33),))
 
@@ -91,10 +92,24 @@ def test_images_that_do_not_decode_are_left_out() -> None:
 
 def test_keyframe_without_depth_has_no_dense_depth() -> None:
     walk = scene.walk()
+    told: list[tuple[int, ...]] = []
     keyframes = list(walk.reconstruction.keyframes)
     keyframes[2] = replace(keyframes[2], in_metres=lambda given: np.zeros_like(given.values))
-    made = densify(replace(walk.reconstruction, keyframes=tuple(keyframes)), walk, EFFORT)
+    made = densify(
+        replace(walk.reconstruction, keyframes=tuple(keyframes)),
+        walk,
+        EFFORT,
+        lambda *steps: told.append(steps),
+    )
     assert [kf.dense is None for kf in made.keyframes] == [n == 2 for n in range(7)]
+    assert told[-1][0] == told[-1][1]
+
+
+def test_keyframes_of_another_trajectory_are_left_as_they_are() -> None:
+    walk = scene.walk()
+    other = Trajectory(walk.timestamps_s + 100.0, walk.reconstruction.trajectory.T_world_camera)
+    given = replace(walk.reconstruction, trajectory=other)
+    assert densify(given, walk, EFFORT) is given
 
 
 def test_too_little_to_compare_changes_nothing() -> None:

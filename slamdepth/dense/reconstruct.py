@@ -87,7 +87,8 @@ def densify(
         if effort not in EFFORTS:
             raise ConfigError(f"effort must be one of {', '.join(EFFORTS)}, got {effort!r}")
         effort = EFFORTS[effort]
-    if len(reconstruction.keyframes) < 2:
+    times_s = set(reconstruction.trajectory.timestamps_s.tolist())
+    if sum(kf.frame.timestamp_s in times_s for kf in reconstruction.keyframes) < 2:
         return reconstruction
     job = _Job(reconstruction, dataset, effort, progress or (lambda done, total: None))
     pool = ThreadPoolExecutor(os.cpu_count() or 1)
@@ -139,6 +140,7 @@ class _Job:
 
     def run(self, pool: ThreadPoolExecutor) -> dict[int, StoredDenseDepth]:
         states = [state for state in self._each(pool, self._begin, self._keyframes) if state is not None]
+        self._total -= (len(self._keyframes) - len(states)) * 2 * len(self._effort.rounds)
         neighbours = _neighbours(states, self._camera)
         depths: list[StoredDenseDepth] = []
         for reach_log, labels in self._effort.rounds:
