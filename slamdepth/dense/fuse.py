@@ -16,6 +16,7 @@ _SENSOR_WEIGHT = 50.0
 
 # deviations of log depth
 _LEAST = 0.012
+_MATCH_PX = 0.25  # of a match, common to neighbouring pixels and views
 _PER_SLOPE = 0.7
 _WITHOUT_EVIDENCE = 0.05
 _WITHOUT_AGREEMENT = 0.02
@@ -49,11 +50,15 @@ def fuse(
     evidence: Floats32,
     agreed: Agreement,
     grey: Bytes,
+    parallax_px: float,
 ) -> Fused:
     """Correct the sheet by what several keyframes measured.
 
     The log ratio of measured depth to the sheet is spread over the image between its edges, so that the
     relief of the sheet fills what no view tells.
+
+    Args:
+        parallax_px: shift of the images of the views per unit of log depth, in pixels.
     """
     confirmed = agreed.is_confirmed & ~is_sensor
     weight = np.where(confirmed, agreed.agree * evidence, np.float32(0.0))
@@ -63,7 +68,7 @@ def fuse(
     correction = spread(ratio, weight, grey, _REACH_PX)
     complete = sheet_m * np.exp(correction)
     off = np.where(confirmed, ratio, np.log(found_m / sheet_m)) - correction
-    sigma = _deviation(confirmed, agreed.agree, evidence, off, complete)
+    sigma = _deviation(confirmed, agreed.agree, evidence, off, complete, parallax_px)
     sigma = np.where(is_sensor, sheet_sigma, sigma)
     with_sensor = bool(is_sensor.any())
     depth = np.where(is_sensor, sheet_m, complete)
@@ -73,17 +78,24 @@ def fuse(
 
 
 def _deviation(
-    confirmed: Bools, agree: Floats32, evidence: Floats32, off: Floats32, depth_m: Floats32
+    confirmed: Bools,
+    agree: Floats32,
+    evidence: Floats32,
+    off: Floats32,
+    depth_m: Floats32,
+    parallax_px: float,
 ) -> Floats32:
     """Deviation of log depth, by what errors of two rendered rooms and a kitchen follow.
 
     Args:
         off: log ratio of what was measured to what is taken, whether it was confirmed or not.
         depth_m: what is taken.
+        parallax_px: see :func:`fuse`.
     """
     slope = _range(np.log(depth_m))
     measured = (
         _LEAST**2
+        + (_MATCH_PX / max(parallax_px, 1e-3)) ** 2
         + (_PER_SLOPE * slope) ** 2
         + (_WITHOUT_EVIDENCE * (1.0 - evidence)) ** 2
         + (_WITHOUT_AGREEMENT * (1.0 - agree / _MOST_AGREE)) ** 2

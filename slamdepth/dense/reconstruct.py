@@ -20,7 +20,7 @@ from slamdepth.dense.fuse import fuse
 from slamdepth.dense.measure import measure
 from slamdepth.dense.rectify import Rectifier
 from slamdepth.dense.sheet import first_sheet
-from slamdepth.dense.views import are_seen, choose_views, surface_points
+from slamdepth.dense.views import are_seen, choose_views, parallax_rad, surface_points
 from slamdepth.errors import ConfigError, ImageDecodeError
 from slamdepth.mapping.codec import encode_half_precision
 from slamdepth.mapping.dense_depth import DenseDepth, StoredDenseDepth, store_dense_depth
@@ -111,6 +111,7 @@ class _State:
     row: int  # of its frame in the trajectory
     points_w: Floats
     maps: dict[str, SpilledArray] = field(default_factory=dict)
+    parallax_rad: float = 0.0  # of its views
 
 
 class _Job:
@@ -200,6 +201,8 @@ class _Job:
             return
         keyframe = self._views.get(state.row)
         assert keyframe is not None
+        poses = np.array([view.T_world_camera for view in views])
+        state.parallax_rad = parallax_rad(state.points_w, state.keyframe.T_world_camera, poses)
         measured = measure(keyframe, present, views, self._camera, reach_log, labels)
         self._put(state, found=present * np.exp(measured.log_ratio), evidence=measured.evidence)
 
@@ -220,7 +223,8 @@ class _Job:
         )
         image_rgb = keyframe.frame.load().image_rgb
         grey = self._views.made(state.row, image_rgb).grey
-        fused = fuse(sheet, np.abs(signed), signed < 0, found, evidence, agreed, grey)
+        parallax_px = state.parallax_rad * 0.5 * (self._camera.fx + self._camera.fy)
+        fused = fuse(sheet, np.abs(signed), signed < 0, found, evidence, agreed, grey, parallax_px)
         self._put(state, present=fused.complete_m)
         color = self._rectifier.color(image_rgb, self._views.positions(state.row))
         depth = DenseDepth(self._camera, color, fused.depth_m, fused.sigma_log, fused.is_measured)

@@ -91,6 +91,25 @@ def choose_views(
     return near[chosen]
 
 
+def parallax_rad(points_w: Floats, T_world_camera: Floats, views: Floats) -> float:
+    """Root mean square, over views, of the median angle at ``points_w (N, 3)`` between keyframe and view.
+
+    Args:
+        T_world_camera: ``(4, 4)`` of the keyframe.
+        views: ``(V, 4, 4)``, at least one.
+    """
+    rays = _directions(points_w, T_world_camera[None])[0]
+    others = _directions(points_w, views)
+    angle = np.arccos(np.clip(np.einsum("nj,vnj->vn", rays, others), -1.0, 1.0))
+    return float(np.sqrt(np.mean(np.median(angle, axis=1) ** 2)))
+
+
+def _directions(points_w: Floats, T_world_camera: Floats) -> Floats:
+    """Unit directions ``(C, N, 3)`` from cameras ``(C, 4, 4)`` to points."""
+    way = points_w[None] - T_world_camera[:, None, :3, 3]
+    return np.asarray(way / np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-9))
+
+
 def _worth(points_w: Floats, rays: Floats, camera: Camera, T_world_camera: Floats) -> Floats:
     inside = are_seen(points_w, camera, T_world_camera)
     share = inside.mean(axis=1)
