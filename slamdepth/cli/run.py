@@ -123,7 +123,7 @@ def run_command(
         str | None,
         typer.Option(
             metavar="off|fast|best",
-            help="Measure the depth of keyframes from many views, for the mesh; 'best' takes three times as "
+            help="Measure the depth of keyframes from many views, for the mesh; 'best' takes five times as "
             "long. Default: fast for predicted depth, off for a sensor's",
         ),
     ] = None,
