@@ -9,6 +9,9 @@ import numpy as np
 
 from slamdepth.typing import Bytes, Floats32
 
+REACH_PX = 60.0
+"""How far what a pixel says reaches over an even image."""
+
 _EDGE_GREY = 8.0  # a step of so many grey values ties two pixels less by e
 _LEAST_TIE = 1e-3
 _COARSEST_PX = 24

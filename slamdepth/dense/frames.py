@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-import numpy as np
-
 from slamdepth.dense.rectify import Rectifier
 from slamdepth.dense.sweep import View
 from slamdepth.frontend.rolling_shutter import velocity_between
@@ -41,23 +39,24 @@ class FrameViews:
         """Where the rectified pixels of a frame come from, see :meth:`Rectifier.positions`."""
         return self._rectifier.positions(self._velocity(row), self._inverse_depth)
 
-    def made(self, row: int, image_rgb: Bytes) -> View:
-        """The view of a frame with this image."""
-        grey = self._rectifier.grey(image_rgb, self.positions(row))
-        return View(np.ascontiguousarray(grey), self._trajectory.T_world_camera[row])
-
     def load(self, rows: Iterable[int]) -> None:
         """Read what is asked for and not there yet, in order, and forget all others."""
         wanted = sorted(set(rows))
         self._views = {row: self._views[row] for row in wanted if row in self._views}
         for row in wanted:
             if row not in self._views:
-                image_rgb = self._read(row)
-                self._views[row] = None if image_rgb is None else self.made(row, image_rgb)
+                self._views[row] = self._made(row)
 
     def get(self, row: int) -> View | None:
         """The view of a frame that was loaded; None where it has no image."""
         return self._views[row]
+
+    def _made(self, row: int) -> View | None:
+        image_rgb = self._read(row)
+        if image_rgb is None:
+            return None
+        grey = self._rectifier.grey(image_rgb, self.positions(row))
+        return View(grey, self._trajectory.T_world_camera[row])
 
     def _velocity(self, row: int) -> Floats | None:
         """Velocity ``(6,)`` of the camera, from the frames before and after; None where unknown."""

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamdepth.dense.agreement import Agreement
-from slamdepth.dense.completion import spread
+from slamdepth.dense.completion import REACH_PX, spread
 from slamdepth.typing import Bools, Bytes, Floats32
 
-_REACH_PX = 60.0
 _SENSOR_WEIGHT = 50.0
 
 # deviations of log depth
+_SENSOR = 0.01
 _LEAST = 0.012
 _MATCH_PX = 0.25  # of a match, common to neighbouring pixels and views
 _PER_SLOPE = 0.7
@@ -44,7 +44,6 @@ class Fused:
 
 def fuse(
     sheet_m: Floats32,
-    sheet_sigma: Floats32,
     is_sensor: Bools,
     found_m: Floats32,
     evidence: Floats32,
@@ -63,16 +62,15 @@ def fuse(
     confirmed = agreed.is_confirmed & ~is_sensor
     weight = np.where(confirmed, agreed.agree * evidence, np.float32(0.0))
     weight = np.where(is_sensor, np.float32(_SENSOR_WEIGHT), weight)
-    ratio = np.log(found_m / sheet_m) + agreed.mean_log
-    ratio = np.where(confirmed, ratio, np.float32(0.0))
-    correction = spread(ratio, weight, grey, _REACH_PX)
+    found = np.log(found_m / sheet_m)
+    ratio = np.where(confirmed, found + agreed.mean_log, np.float32(0.0))
+    correction = spread(ratio, weight, grey, REACH_PX)
     complete = sheet_m * np.exp(correction)
-    off = np.where(confirmed, ratio, np.log(found_m / sheet_m)) - correction
+    off = np.where(confirmed, ratio, found) - correction
     sigma = _deviation(confirmed, agreed.agree, evidence, off, complete, parallax_px)
-    sigma = np.where(is_sensor, sheet_sigma, sigma)
-    with_sensor = bool(is_sensor.any())
+    sigma = np.where(is_sensor, np.float32(_SENSOR), sigma)
     depth = np.where(is_sensor, sheet_m, complete)
-    if with_sensor:
+    if is_sensor.any():
         depth = np.where(is_sensor | confirmed, depth, np.float32(0.0))
     return Fused(complete, depth.astype(np.float32), sigma.astype(np.float32), is_sensor | confirmed)
 

@@ -177,13 +177,14 @@ class _Job:
     def _begin(self, keyframe: Keyframe) -> _State | None:
         """The sheet of a keyframe."""
         row = self._row[keyframe.frame.timestamp_s]
-        grey = self._views.made(row, keyframe.frame.load().image_rgb).grey
-        sheet = first_sheet(keyframe, self._rectifier, self._views.positions(row), grey)
+        positions = self._views.positions(row)
+        grey = self._rectifier.grey(keyframe.frame.load().image_rgb, positions)
+        sheet = first_sheet(keyframe, self._rectifier, positions, grey)
         if sheet is None:
             return None
         state = _State(keyframe, row, surface_points(sheet.depth_m, self._camera, keyframe.T_world_camera))
-        sign = np.where(sheet.is_sensor, np.float32(-1.0), np.float32(1.0))
-        self._put(state, sheet=sheet.depth_m, sigma=sheet.sigma_log * sign, present=sheet.depth_m)
+        is_sensor = sheet.is_sensor.astype(np.float32)
+        self._put(state, sheet=sheet.depth_m, is_sensor=is_sensor, present=sheet.depth_m)
         return state
 
     def _chosen(self, state: _State) -> list[int]:
@@ -212,8 +213,8 @@ class _Job:
         """Keep what other keyframes confirm, and complete it by the sheet."""
         state = states[place]
         keyframe, others = state.keyframe, [states[n] for n in neighbours[place]]
-        found, evidence, sheet, signed = (
-            state.maps[name].load() for name in ("found", "evidence", "sheet", "sigma")
+        found, evidence, sheet, is_sensor = (
+            state.maps[name].load() for name in ("found", "evidence", "sheet", "is_sensor")
         )
         agreed = agreement(
             found,
@@ -222,11 +223,12 @@ class _Job:
             self._camera,
         )
         image_rgb = keyframe.frame.load().image_rgb
-        grey = self._views.made(state.row, image_rgb).grey
+        positions = self._views.positions(state.row)
+        grey = self._rectifier.grey(image_rgb, positions)
         parallax_px = state.parallax_rad * 0.5 * (self._camera.fx + self._camera.fy)
-        fused = fuse(sheet, np.abs(signed), signed < 0, found, evidence, agreed, grey, parallax_px)
+        fused = fuse(sheet, is_sensor > 0, found, evidence, agreed, grey, parallax_px)
         self._put(state, present=fused.complete_m)
-        color = self._rectifier.color(image_rgb, self._views.positions(state.row))
+        color = self._rectifier.color(image_rgb, positions)
         depth = DenseDepth(self._camera, color, fused.depth_m, fused.sigma_log, fused.is_measured)
         return store_dense_depth(depth, self._file)
 

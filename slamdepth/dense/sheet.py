@@ -7,16 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamdepth.dense.completion import spread
+from slamdepth.dense.completion import REACH_PX, spread
 from slamdepth.dense.rectify import Rectifier
-from slamdepth.depth.alignment import DEFAULT_SIGMA_LOG
 from slamdepth.mapping.keyframe import Keyframe
 from slamdepth.typing import Bools, Bytes, Floats32
 
 _LEAST_KNOWN = 0.05
-_HOLE_SIGMA = 0.3  # of depth filled into the holes of a sensor's
-_SENSOR_SIGMA = 0.01
-_REACH_PX = 60.0
 
 
 @dataclass(frozen=True)
@@ -25,12 +21,10 @@ class Sheet:
 
     Attributes:
         depth_m: ``(h, w)`` above 0 everywhere.
-        sigma_log: ``(h, w)`` deviation of its natural log.
         is_sensor: ``(h, w)`` where a sensor measured it.
     """
 
     depth_m: Floats32
-    sigma_log: Floats32
     is_sensor: Bools
 
 
@@ -44,17 +38,9 @@ def first_sheet(
     known = depth > 0
     if known.mean() < _LEAST_KNOWN:
         return None
-    if prediction.is_sensor:
-        sigma = np.where(known, _SENSOR_SIGMA, _HOLE_SIGMA).astype(np.float32)
-    elif prediction.sigma_log is None:
-        sigma = np.full(depth.shape, DEFAULT_SIGMA_LOG, np.float32)
-    else:
-        given = prediction.sigma_log.astype(np.float32)
-        sigma = rectifier.nearest(np.nan_to_num(given, nan=DEFAULT_SIGMA_LOG), positions)
-        sigma = np.where(sigma > 0, sigma, np.float32(_HOLE_SIGMA))
     if not known.all():
         centre = np.float32(np.log(np.median(depth[known])))
         log = np.where(known, np.log(np.where(known, depth, 1.0)) - centre, 0.0)
-        filled = spread(log.astype(np.float32), known.astype(np.float32), grey, _REACH_PX)
+        filled = spread(log.astype(np.float32), known.astype(np.float32), grey, REACH_PX)
         depth = np.where(known, depth, np.exp(filled + centre)).astype(np.float32)
-    return Sheet(depth, sigma, known & prediction.is_sensor)
+    return Sheet(depth, known & prediction.is_sensor)

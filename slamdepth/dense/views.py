@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slamdepth.geometry import backproject
+from slamdepth.geometry import backproject, transform
 from slamdepth.types import Camera
 from slamdepth.typing import Bools, Floats, Floats32, Ints
 
@@ -24,8 +24,7 @@ def surface_points(depth_m: Floats32, camera: Camera, T_world_camera: Floats) ->
     z = depth_m[v, u].ravel()
     known = z > 0
     px = np.column_stack([u.ravel(), v.ravel()])[known].astype(np.float64)
-    points = backproject(camera, px, z[known].astype(np.float64))
-    return np.asarray(points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])
+    return transform(T_world_camera, backproject(camera, px, z[known].astype(np.float64)))
 
 
 def are_seen(points_w: Floats, camera: Camera, T_world_camera: Floats) -> Bools:
