@@ -100,7 +100,7 @@ def evaluate_mesh(asked: MeshQuestion, progress: Callable[[int, int], None] | No
             "trajectories by; align the files beforehand and leave out --align and --trajectory"
         )
     truth = read_surface(asked.reference)
-    return _evaluated(surface, truth, None, Alignment.NONE, np.eye(4), None, notes)
+    return _evaluated(surface, truth, None, Alignment.NONE, np.eye(4), notes)
 
 
 def _files(asked: MeshQuestion) -> tuple[Path, Path | None, list[str]]:
@@ -142,7 +142,7 @@ def _against_sequence(
         notes = [*notes, *path_notes]
     indices = RunOptions(asked.reference, max_frames=asked.max_frames).indices(len(dataset))
     seen = sensor_reference(dataset, indices, max_depth_m=asked.max_depth_m, progress=progress)
-    return _evaluated(surface, truth_of(seen), seen, align, T, seen.cameras, [*dataset.notes, *notes])
+    return _evaluated(surface, truth_of(seen), seen, align, T, [*dataset.notes, *notes])
 
 
 def _evaluated(
@@ -151,7 +151,6 @@ def _evaluated(
     seen: SensorSurface | None,
     align: Alignment,
     T: Floats,
-    cameras: Floats | None,
     notes: list[str],
 ) -> MeshEvaluation:
     estimate = surface.moved(T)
@@ -164,6 +163,6 @@ def _evaluated(
         reference,
         vertex_errors_m(estimate, reference, can_judge),
         vertex_errors_m(reference, estimate),
-        cameras,
+        None if seen is None else seen.cameras,
         tuple(notes),
     )

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -62,14 +63,13 @@ def render_mesh_images(mesh: Mesh, run: Reconstruction) -> tuple[MeshImage, ...]
     poses = run.trajectory.T_world_camera
     if len(mesh.triangles) == 0 or len(poses) == 0:
         return ()
-    gravity_w = guessed_gravity(poses) if run.gravity_w is None else run.gravity_w
+    gravity_w = _gravity(run)
     level = (
         "upright by gravity"
         if run.gravity_w is not None
         else "which way is up is guessed from how the camera was held"
     )
-    wide = ideal_camera(WIDTH, HEIGHT, 50.0)
-    T = from_above(mesh, poses[:, :3, 3], gravity_w, wide)
+    wide, T = overview(mesh, poses, gravity_w)
     whole = render_mesh(mesh, wide, T, BACKGROUND)
     images = [
         MeshImage(
@@ -105,9 +105,7 @@ def render_errors(mesh: Mesh, errors_m: Floats, run: Reconstruction) -> tuple[Me
     poses = run.trajectory.T_world_camera
     if len(mesh.triangles) == 0 or len(poses) == 0:
         return ()
-    gravity_w = guessed_gravity(poses) if run.gravity_w is None else run.gravity_w
-    wide = ideal_camera(WIDTH, HEIGHT, 50.0)
-    T = from_above(mesh, poses[:, :3, 3], gravity_w, wide)
+    wide, T = overview(mesh, poses, _gravity(run))
     colours = error_colours(errors_m).astype(np.float32) / np.float32(255.0)
     image = render_mesh(replace(mesh, colors=colours), wide, T, BACKGROUND)
     return (
@@ -117,6 +115,17 @@ def render_errors(mesh: Mesh, errors_m: Floats, run: Reconstruction) -> tuple[Me
             image,
         ),
     )
+
+
+def overview(mesh: Mesh, poses: Floats, gravity_w: Floats) -> tuple[Camera, Floats]:
+    """A camera that sees the mesh from above and behind cameras ``(N, 4, 4)``, and its pose ``(4, 4)``."""
+    wide = ideal_camera(WIDTH, HEIGHT, 50.0)
+    return wide, from_above(mesh, poses[:, :3, 3], gravity_w, wide)
+
+
+def _gravity(run: Reconstruction) -> Floats:
+    """Direction of gravity in the world frame, guessed where the run has none."""
+    return guessed_gravity(run.trajectory.T_world_camera) if run.gravity_w is None else run.gravity_w
 
 
 def error_colours(errors_m: Floats) -> NDArray[np.uint8]:
@@ -131,8 +140,17 @@ def write_mesh_png(path: Path, images: tuple[MeshImage, ...]) -> None:
     Raises:
         OutputError: ``path`` cannot be written.
     """
-    stripe = np.full((images[0].image_rgb.shape[0], _STRIPE, 3), 255, np.uint8)
-    row = [part for image in images for part in (stripe, image.image_rgb)]
+    write_side_by_side(path, [image.image_rgb for image in images])
+
+
+def write_side_by_side(path: Path, images: Sequence[NDArray[np.uint8]]) -> None:
+    """Write images ``(H, W, 3)`` RGB of one height side by side, a white stripe between them.
+
+    Raises:
+        OutputError: ``path`` cannot be written.
+    """
+    stripe = np.full((images[0].shape[0], _STRIPE, 3), 255, np.uint8)
+    row = [part for image in images for part in (stripe, image)]
     write_png(path, np.hstack(row[1:]))
 
 

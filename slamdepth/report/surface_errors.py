@@ -8,14 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from slamdepth.evaluation import Surface
-from slamdepth.io import encode_ply, replacing, write_png
+from slamdepth.io import encode_ply, replacing
 from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.raycast import render_mesh
-from slamdepth.report.mesh_images import BACKGROUND, HEIGHT, WIDTH, error_colours
-from slamdepth.report.viewpoints import from_above, guessed_gravity, ideal_camera
+from slamdepth.report.mesh_images import BACKGROUND, error_colours, overview, write_side_by_side
+from slamdepth.report.viewpoints import guessed_gravity
 from slamdepth.typing import Floats
-
-_STRIPE = 8  # pixels
 
 
 def write_error_ply(path: Path, surface: Surface, errors_m: Floats) -> None:
@@ -54,9 +52,6 @@ def write_error_image(path: Path, surfaces: list[tuple[Surface, Floats]], camera
         )
         for surface, errors_m in surfaces
     ]
-    wide = ideal_camera(WIDTH, HEIGHT, 50.0)
-    T = from_above(meshes[0], cameras[:, :3, 3], guessed_gravity(cameras), wide)
-    stripe = np.full((HEIGHT, _STRIPE, 3), 255, np.uint8)
-    row = [part for mesh in meshes for part in (stripe, render_mesh(mesh, wide, T, BACKGROUND))]
-    write_png(path, np.hstack(row[1:]))
+    wide, T = overview(meshes[0], cameras, guessed_gravity(cameras))
+    write_side_by_side(path, [render_mesh(mesh, wide, T, BACKGROUND) for mesh in meshes])
     return True
