@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
+from slamdepth.datasets.intrinsics import CameraSource, Certainty
 from slamdepth.errors import ImageDecodeError
 from slamdepth.types import Camera, Frame, Trajectory
 
@@ -29,6 +30,7 @@ class Dataset(Protocol):
         name: short name, used for run folders.
         path: where it lies.
         camera: its camera.
+        camera_source: where the intrinsics come from.
         timestamps_s: ``(N,)`` float64 seconds, strictly increasing.
         has_depth: True where sensor depth can be read.
         ground_truth: poses of the camera, or None.
@@ -38,6 +40,7 @@ class Dataset(Protocol):
     name: str
     path: Path
     camera: Camera
+    camera_source: CameraSource = CameraSource(Certainty.GIVEN, "the files of the sequence")
     timestamps_s: NDArray[np.float64]
     has_depth: bool
     ground_truth: Trajectory | None

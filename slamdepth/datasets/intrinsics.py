@@ -28,6 +28,20 @@ class Certainty(str, Enum):
 
 
 @dataclass(frozen=True)
+class CameraSource:
+    """Where the intrinsics of a sequence come from.
+
+    Attributes:
+        certainty: GIVEN by a file or a known data set, NOMINAL from what the recording says of its lens, or
+            GUESSED.
+        how: the same as a user should read it, such as "camera.yaml next to the images".
+    """
+
+    certainty: Certainty
+    how: str
+
+
+@dataclass(frozen=True)
 class Intrinsics:
     """A camera, and how certain it is.
 
