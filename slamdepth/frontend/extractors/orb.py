@@ -64,7 +64,8 @@ class OrbExtractor:
 
     def extract(self, gray: NDArray[np.uint8], camera: Camera) -> Features:
         """See :class:`slamdepth.frontend.features.FeatureExtractor`."""
-        raw_px, octave, descriptors = self.found(gray)
+        found_px, octave, descriptors = self.found(gray)
+        raw_px = self._centred(found_px, octave, gray.shape)
         return Features(
             raw_px=raw_px,
             px=camera.undistort_points(raw_px),
@@ -91,6 +92,19 @@ class OrbExtractor:
         chosen, descriptors = orb.compute(gray, [keypoints[i] for i in kept])
         octave = np.array([k.octave for k in chosen], dtype=np.int64)
         return pixels(chosen), octave, np.ascontiguousarray(descriptors) if len(chosen) else ORB.empty()
+
+    def _centred(self, px: Floats, octave: Ints, shape: tuple[int, ...]) -> Floats:
+        """Where the keypoints ``(N, 2)`` really lie.
+
+        OpenCV multiplies a pixel of a level by the level's nominal scale. Pixels of two levels have the same
+        edge in common, not the same centre, and levels have whole numbers of pixels: its coarsest keypoints
+        are up to two pixels off.
+        """
+        nominal = np.float32(self.levels.factor) ** np.arange(self.levels.count, dtype=np.float32)
+        whole = np.array(shape[1::-1], dtype=np.float64)
+        sizes = np.rint(whole * (np.float32(1.0) / nominal)[:, None])
+        of_level = np.rint(px / nominal[octave][:, None])
+        return (of_level + 0.5) * (whole / sizes)[octave] - 0.5
 
     def _agrees(self, scale_factor: float, levels: int) -> bool:
         """Whether OpenCV's ORB and the compiled one find the same in noise; asked once a process."""
