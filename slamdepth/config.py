@@ -89,6 +89,9 @@ class BundleConfig(_Section):
     fixed: int = Field(6, ge=1, description="further keyframes, with fixed poses, that constrain the window")
     local: bool = Field(True, description="adjust a window after each new keyframe")
     final: bool = Field(True, description="adjust the whole map once at the end")
+    align: bool = Field(
+        True, description="at the end, align keypoints in the images to one view of each landmark"
+    )
     prior_inflation: float = Field(
         6.0,
         ge=1,

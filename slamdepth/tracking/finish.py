@@ -21,6 +21,7 @@ from slamdepth.stopwatch import Stopwatch
 from slamdepth.tracking.atlas import Atlas
 from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.integration import KeyframeIntegration
+from slamdepth.tracking.keypoint_alignment import align_keypoints
 from slamdepth.tracking.local_mapper import LocalMapper
 from slamdepth.tracking.map_tracker import MapTracker
 from slamdepth.tracking.rolling_shutter import RollingShutter
@@ -32,6 +33,7 @@ _SEARCHED_AGAIN = 6  # neighbours of each keyframe; twice as many gain nothing m
 _PASSES = 3  # after the first adjustment; more than one only while the readout time changes
 _CONVERGED_S = 0.002  # change of the readout time
 _OTHER_START = (5, 10)  # steps of adjustments from two starts, of which the better one is kept
+_ALIGNED_STEPS = (3, 6)
 _READOUT_KEYFRAMES = 200  # latest ones: more tell no more of the readout time
 
 
@@ -81,7 +83,7 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
         tracked.integration, tracked.map, tracked.frames, tracked.shutter,
     )  # fmt: skip
     with watch.timed("final"):
-        final = optimise_map(map_, integration, frames, shutter, config)
+        final = optimise_map(tracked, config)
     statistics = RunStatistics(
         frames=steps,
         tracked=len(frames),
@@ -120,13 +122,16 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
     )
 
 
-def optimise_map(
-    map_: Map, integration: KeyframeIntegration, frames: FrameLog, shutter: RollingShutter, config: Config
-) -> FinalMap:
+def optimise_map(tracked: MapTracker, config: Config) -> FinalMap:
     """Global bundle adjustment and metric scale."""
+    map_, integration, shutter = tracked.map, tracked.integration, tracked.shutter
     notes: list[str] = []
     is_adjusted = config.bundle.final and len(map_.keyframes) >= 3
-    if is_adjusted and _adjust_all(map_, integration, frames, shutter):
+    is_other = is_adjusted and _adjust_all(map_, integration, tracked.frames, shutter)
+    if is_adjusted and config.bundle.align and align_keypoints(map_, shutter, tracked.localiser.levels):
+        every = [keyframe.id for keyframe in map_.keyframes]
+        integration.adjuster.adjust(every, [], map_.seen_by(2), _ALIGNED_STEPS)
+    if is_other:
         notes.append(
             "keyframes that share few landmarks were re-registered from those that share many: their "
             "poses while the tracker ran were wrong"

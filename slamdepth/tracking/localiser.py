@@ -39,6 +39,7 @@ class Localiser:
         levels: of the extractor whose features it is given; None takes ORB's.
 
     Attributes:
+        levels: of the features.
         view_change: whether the camera takes large steps, which decides how poses are estimated.
     """
 
@@ -48,12 +49,12 @@ class Localiser:
         self._camera = camera.without_distortion()
         self._config = config
         self._map = map_
-        self._levels = levels or ScaleLevels(config.features.scale_factor, config.features.levels)
+        self.levels = levels or ScaleLevels(config.features.scale_factor, config.features.levels)
         self.view_change = ViewChange(map_)
 
     def expected(self, T_camera_world: Floats, ids: Ints) -> Visible:
         """Which of the landmarks ``ids (N,)`` a camera at ``T_camera_world (4, 4)`` should see, and where."""
-        return visible_landmarks(self._camera, self._levels, self._map.landmarks, T_camera_world, ids)
+        return visible_landmarks(self._camera, self.levels, self._map.landmarks, T_camera_world, ids)
 
     def search(
         self,
@@ -83,7 +84,7 @@ class Localiser:
             visible,
             self._map.landmarks,
             features,
-            self._levels,
+            self.levels,
             SearchWindow(radius_px, max_px, sigmas),
             max_distance=metric.strict_distance if is_strict else metric.max_distance,
             ratio=ratio,

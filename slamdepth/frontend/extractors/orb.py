@@ -104,7 +104,7 @@ class OrbExtractor:
         whole = np.array(shape[1::-1], dtype=np.float64)
         sizes = np.rint(whole * (np.float32(1.0) / nominal)[:, None])
         of_level = np.rint(px / nominal[octave][:, None])
-        return (of_level + 0.5) * (whole / sizes)[octave] - 0.5
+        return np.asarray((of_level + 0.5) * (whole / sizes)[octave] - 0.5)
 
     def _agrees(self, scale_factor: float, levels: int) -> bool:
         """Whether OpenCV's ORB and the compiled one find the same in noise; asked once a process."""

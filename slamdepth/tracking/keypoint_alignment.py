@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keypoints of a finished map, aligned in the images to one view of each landmark.
+
+A detector found a landmark's observations in each image on its own. Here the patch about one of them, of the
+view nearest to the middle of all, is found again in the others to a fraction of a pixel. Keypoint adjustment
+is that of Lindenberger et al., "Pixel-Perfect Structure-from-Motion" (ICCV 2021), by grey values here.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamdepth.frontend.features import Features, ScaleLevels
+from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, align
+from slamdepth.mapping.map import Map, MapKeyframe
+from slamdepth.tracking.rolling_shutter import RollingShutter
+from slamdepth.tracking.workers import in_parallel
+from slamdepth.typing import Bools, Floats, Ints
+
+log = logging.getLogger(__name__)
+
+_SHARE = 0.25
+"""An aligned keypoint's deviation over a detected one's."""
+_LEAST_CORRELATION = 0.85
+_FARTHEST = 2.5  # deviations of a detected keypoint
+_MOST_ZOOM = 2.0  # of one view against another: a patch at another size shows other things
+_TEMPLATES = 30_000  # in memory at a time, 1 kB each
+
+
+def align_keypoints(map_: Map, shutter: RollingShutter, levels: ScaleLevels) -> int:
+    """Move the keypoints of all landmarks that several keyframes see; each becomes more certain.
+
+    Args:
+        levels: of the detector.
+
+    Returns:
+        How many observations were aligned.
+    """
+    references = _References.of(map_)
+    keypoints = [_Keypoints.of(keyframe) for keyframe in map_.keyframes]
+    count = 0
+    for landmark_ids in references.batches():
+        batch = _Batch.of(map_, references, landmark_ids)
+        with in_parallel(batch.aligned, keypoints) as aligning:
+            keypoints = [aligned.result() for aligned in aligning]
+    for found in keypoints:
+        keyframe, features = found.keyframe, found.features
+        sigma_px = levels.sigma_px(features.octave) * np.where(found.is_aligned, _SHARE, 1.0)
+        px = keyframe.frame.camera.undistort_points(found.raw_px)
+        map_.set_features(keyframe, replace(features, raw_px=found.raw_px, px=px, sigma_px=sigma_px))
+        count += int(np.count_nonzero(found.is_aligned))
+    shutter.correct_keyframes()
+    log.info("%d of %d observations aligned in the images", count, references.observations)
+    return count
+
+
+@dataclass(frozen=True)
+class _References:
+    """The view of each landmark that the others are aligned to.
+
+    Attributes:
+        keyframe, feature: ``(P,)`` of the view, -1 where fewer than two keyframes see the landmark.
+        observations: number of all views of these landmarks.
+    """
+
+    keyframe: Ints
+    feature: Ints
+    observations: int
+
+    @classmethod
+    def of(cls, map_: Map) -> _References:
+        """The view of each landmark nearest to the mean direction it is seen from."""
+        size, keyframes = map_.size, map_.keyframes
+        seen = [_seen(keyframe) for keyframe in keyframes]
+        directions = [
+            _unit(keyframe.center_w - map_.landmarks.position_w[ids])
+            for keyframe, (_, ids) in zip(keyframes, seen, strict=True)
+        ]
+        total, mean = np.zeros(size, dtype=np.int64), np.zeros((size, 3))
+        for (_, ids), direction in zip(seen, directions, strict=True):
+            total[ids] += 1  # a keyframe sees a landmark once
+            mean[ids] += direction
+        mean = _unit(mean)
+        best, chosen, chosen_feature = np.full(size, -np.inf), np.full(size, -1), np.full(size, -1)
+        for number, ((at, ids), direction) in enumerate(zip(seen, directions, strict=True)):
+            nearness = np.einsum("ni,ni->n", direction, mean[ids])
+            better = (nearness > best[ids]) & (total[ids] >= 2)
+            ids = ids[better]
+            best[ids], chosen[ids], chosen_feature[ids] = nearness[better], number, at[better]
+        return cls(chosen, chosen_feature, int(total[total >= 2].sum()))
+
+    def batches(self) -> Iterator[Ints]:
+        """Landmarks whose views are in one another's company, by keyframe, some at a time."""
+        ids = np.flatnonzero(self.keyframe >= 0)
+        ids = ids[np.argsort(self.keyframe[ids], kind="stable")]
+        for start in range(0, len(ids), _TEMPLATES):
+            yield ids[start : start + _TEMPLATES]
+
+
+@dataclass(frozen=True)
+class _Keypoints:
+    """Of a keyframe: pixels ``(N, 2)`` as they are now, and which of them are aligned ``(N,)``."""
+
+    keyframe: MapKeyframe
+    raw_px: Floats
+    is_aligned: Bools
+
+    @classmethod
+    def of(cls, keyframe: MapKeyframe) -> _Keypoints:
+        raw_px: Floats = keyframe.features.raw_px
+        return cls(keyframe, raw_px, np.zeros(len(raw_px), dtype=np.bool_))
+
+    @property
+    def features(self) -> Features:
+        features: Features = self.keyframe.features
+        return features
+
+    def moved(self, at: Ints, px: Floats) -> _Keypoints:
+        """With the features ``at`` aligned to ``px (M, 2)``."""
+        raw_px, is_aligned = self.raw_px.copy(), self.is_aligned.copy()
+        raw_px[at], is_aligned[at] = px, True
+        return _Keypoints(self.keyframe, raw_px, is_aligned)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Some landmarks, and the patch about each in the view that the others are aligned to.
+
+    Attributes:
+        place: ``(P,)`` of each landmark of the map in ``templates``, -1 for none.
+    """
+
+    map_: Map
+    references: _References
+    place: Ints
+    templates: Templates
+
+    @classmethod
+    def of(cls, map_: Map, references: _References, landmark_ids: Ints) -> _Batch:
+        """The landmarks ``landmark_ids``, which are ordered by the keyframe of their view."""
+        place = np.full(map_.size, -1)
+        place[landmark_ids] = np.arange(len(landmark_ids))
+        parts = []
+        of_keyframe = references.keyframe[landmark_ids]
+        for number in np.unique(of_keyframe):
+            keyframe = map_.keyframes[number]
+            features: Features = keyframe.features
+            at = references.feature[landmark_ids[of_keyframe == number]]
+            # finer than the level of the detector, which is where its error comes from
+            spacing_px = np.sqrt(features.sigma_px[at])
+            image = ImagePyramid(keyframe.frame.load().image_rgb)
+            parts.append(Templates.of(image, features.raw_px[at], spacing_px))
+        return cls(map_, references, place, Templates.joined(parts))
+
+    def aligned(self, keypoints: _Keypoints) -> _Keypoints:
+        """Align what a keyframe sees of these landmarks."""
+        keyframe = keypoints.keyframe
+        at, ids = _seen(keyframe)
+        known = (self.place[ids] >= 0) & self.templates.is_usable[self.place[ids]]
+        is_other = self.references.keyframe[ids] != keyframe.id
+        own = at[known & ~is_other]
+        keypoints = keypoints.moved(own, keypoints.raw_px[own])
+        at, ids = at[known & is_other], ids[known & is_other]
+        if len(at) == 0:
+            return keypoints
+        image = ImagePyramid(keyframe.frame.load().image_rgb)
+        warp = _warp(self.map_, keyframe, ids, self.references.keyframe[ids])
+        px, correlation = align(image, self.templates.taken(self.place[ids]), warp, keypoints.raw_px[at])
+        zoom = np.sqrt(np.abs(np.linalg.det(warp)))
+        way = np.linalg.norm(px - keypoints.raw_px[at], axis=1) / keypoints.features.sigma_px[at]
+        good = (correlation > _LEAST_CORRELATION) & (way < _FARTHEST)
+        good &= (zoom < _MOST_ZOOM) & (zoom > 1.0 / _MOST_ZOOM)
+        return keypoints.moved(at[good], px[good])
+
+
+def _warp(map_: Map, keyframe: MapKeyframe, landmark_ids: Ints, references: Ints) -> Floats:
+    """``(N, 2, 2)`` from offsets in pixels of each landmark's view to offsets in ``keyframe``.
+
+    Surfaces are taken to face the view they are aligned to.
+    """
+    camera = keyframe.frame.camera
+    focal = np.array([camera.fx, camera.fy])
+    position = map_.landmarks.position_w[landmark_ids]
+    T = keyframe.T_camera_world
+    x, y, z = (position @ T[:3, :3].T + T[:3, 3]).T
+    zero = np.zeros_like(z)
+    projection = np.stack([np.stack([1 / z, zero, -x / z**2], 1), np.stack([zero, 1 / z, -y / z**2], 1)], 1)
+    warp = np.empty((len(landmark_ids), 2, 2))
+    for number in np.unique(references):
+        at = np.flatnonzero(references == number)
+        T_other = map_.keyframes[number].T_camera_world
+        depth = position[at] @ T_other[2, :3] + T_other[2, 3]
+        rotation = (T[:3, :3] @ T_other[:3, :3].T)[:, :2] / focal
+        warp[at] = focal[:, None] * (projection[at] @ rotation) * depth[:, None, None]
+    return warp
+
+
+def _seen(keyframe: MapKeyframe) -> tuple[Ints, Ints]:
+    """Features with a landmark, and their landmarks."""
+    at = np.flatnonzero(keyframe.landmark_ids >= 0)
+    return at, keyframe.landmark_ids[at]
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
