@@ -128,6 +128,22 @@ def test_a_blank_image_has_none(extractor: FeatureExtractor, grey: int) -> None:
     assert features.place_descriptors.shape == (0, 32)
 
 
+@pytest.mark.parametrize("level", range(8))
+def test_orb_finds_the_same_places_in_an_image_turned_by_180_degrees(
+    orb: FeatureExtractor, level: int
+) -> None:
+    # OpenCV's own places of a level are off by up to two pixels, the same way in both images
+    camera = Camera(640, 480, 500, 500, 319.5, 239.5)
+    gray = np.asarray(cv2.resize(image(), (640, 480), interpolation=cv2.INTER_CUBIC), np.uint8)
+    upright, turned = (orb.extract(np.ascontiguousarray(one), camera) for one in (gray, gray[::-1, ::-1]))
+    a = upright.raw_px[upright.octave == level]
+    b = [639, 479] - turned.raw_px[turned.octave == level]
+    away = np.linalg.norm(a[:, None] - b, axis=2)
+    same = np.flatnonzero(away.min(axis=1) < 0.5 * orb.levels.sigma_px(np.array([level])))
+    assert len(same) > 0.5 * len(a) > 0
+    np.testing.assert_allclose(np.median(a[same] - b[away[same].argmin(axis=1)], axis=0), 0, atol=0.02)
+
+
 def test_an_image_too_small_for_a_patch_has_none(orb: FeatureExtractor) -> None:
     camera = Camera(24, 20, 20, 20, 11.5, 9.5)
     gray = np.random.default_rng(0).integers(0, 256, (20, 24), dtype=np.uint8)
