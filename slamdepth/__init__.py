@@ -39,9 +39,11 @@ if TYPE_CHECKING:
     from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
     from slamdepth.mapping.mesh import Mesh
     from slamdepth.mapping.reconstruction import Reconstruction
+    from slamdepth.mapstore import Map, Session
     from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage
+    from slamdepth.pipeline.localize import Localisation, localize
     from slamdepth.pipeline.run import run
-    from slamdepth.tracking import CloudTracker, Tracker, create_tracker
+    from slamdepth.tracking import CloudTracker, MapLocaliser, Tracker, create_tracker
     from slamdepth.types import (
         Camera,
         DepthKind,
@@ -75,6 +77,9 @@ _HOME = {
     "ImageMatcher": "slamdepth.frontend.features",
     "InputError": "slamdepth.errors",
     "Keyframe": "slamdepth.mapping.keyframe",
+    "Localisation": "slamdepth.pipeline.localize",
+    "Map": "slamdepth.mapstore",
+    "MapLocaliser": "slamdepth.tracking",
     "Mesh": "slamdepth.mapping.mesh",
     "OutputError": "slamdepth.errors",
     "PointCloud": "slamdepth.mapping.cloud",
@@ -86,6 +91,7 @@ _HOME = {
     "RunResult": "slamdepth.pipeline",
     "RunStage": "slamdepth.pipeline",
     "RunStatistics": "slamdepth.types",
+    "Session": "slamdepth.mapstore",
     "SlamdepthError": "slamdepth.errors",
     "StepResult": "slamdepth.types",
     "StoredDenseDepth": "slamdepth.mapping.dense_depth",
@@ -101,6 +107,7 @@ _HOME = {
     "create_depth_model": "slamdepth.depth.registry",
     "create_tracker": "slamdepth.tracking",
     "densify": "slamdepth.dense",
+    "localize": "slamdepth.pipeline.localize",
     "open_dataset": "slamdepth.datasets",
     "read_tum_trajectory": "slamdepth.io",
     "run": "slamdepth.pipeline.run",
@@ -129,6 +136,9 @@ __all__ = [
     "ImageMatcher",
     "InputError",
     "Keyframe",
+    "Localisation",
+    "Map",
+    "MapLocaliser",
     "Mesh",
     "OutputError",
     "PointCloud",
@@ -140,6 +150,7 @@ __all__ = [
     "RunResult",
     "RunStage",
     "RunStatistics",
+    "Session",
     "SlamdepthError",
     "StepResult",
     "StoredDenseDepth",
@@ -156,6 +167,7 @@ __all__ = [
     "create_depth_model",
     "create_tracker",
     "densify",
+    "localize",
     "open_dataset",
     "read_tum_trajectory",
     "run",

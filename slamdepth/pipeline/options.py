@@ -26,6 +26,8 @@ class RunOptions:
         stride: take every Nth frame.
         mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
+        start_map: a run whose map this run goes on from.
+        map_images: keep images in the map.
 
     Raises:
         ConfigError: ``stride`` or ``max_frames`` is below 1.
@@ -38,6 +40,8 @@ class RunOptions:
     stride: int = 1
     mesh: bool = True
     overwrite: bool = False
+    start_map: Path | None = None
+    map_images: bool = False
 
     def __post_init__(self) -> None:
         check_frames_asked(self.stride, self.max_frames)
