@@ -15,6 +15,7 @@ from pathlib import Path
 from slamdepth.errors import OutputError
 from slamdepth.io import writable, write_text
 from slamdepth.mapstore import remove_map
+from slamdepth.pipeline import checkpoint
 
 FILES = {
     "trajectory.txt": "every frame placed in the largest map, after optimisation (TUM, camera to world)",
@@ -86,7 +87,7 @@ class RunFolder:
                 raise OutputError(f"{path}: is a file; name a folder for the results")
             if not (path.is_dir() and any(path.iterdir())):
                 return cls(writable(path))
-            if not _is_run(path):
+            if not is_run(path):
                 raise OutputError(f"{path}: is not empty and holds no earlier run; name a new folder")
         except OSError as error:
             raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -141,6 +142,7 @@ class RunFolder:
         for name in FILES:
             (self.path / name).unlink(missing_ok=True)
         remove_map(self.path / MAP)
+        checkpoint.remove(self.path)
         maps = self.path / MAPS
         if maps.is_symlink() or not maps.is_dir():
             return
@@ -177,21 +179,25 @@ def run_log() -> Iterator[logging.handlers.MemoryHandler]:
             target.close()
 
 
-def write_log_to(buffer: logging.handlers.MemoryHandler, path: Path) -> None:
+def write_log_to(buffer: logging.handlers.MemoryHandler, path: Path, *, goes_on: bool = False) -> None:
     """Write the messages so far and all later ones to ``path``.
+
+    Args:
+        goes_on: behind those of an earlier process.
 
     Raises:
         OutputError: ``path`` cannot be written.
     """
     with writing(path):
-        file = logging.FileHandler(path, mode="w", encoding="utf-8")
+        file = logging.FileHandler(path, mode="a" if goes_on else "w", encoding="utf-8")
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
     buffer.setTarget(file)
     buffer.flush()
     buffer.flushLevel = logging.DEBUG  # from now on line by line, so that a killed run leaves its log
 
 
-def _is_run(path: Path) -> bool:
+def is_run(path: Path) -> bool:
+    """Whether a folder holds a run, finished or not."""
     try:
         return (path / _README).read_text(encoding="utf-8").startswith(_MARK)
     except (OSError, UnicodeDecodeError):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from types import TracebackType
 
 import numpy as np
@@ -15,6 +16,8 @@ from slamdepth.frontend.compiled import load
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.preparation import Preparation, Prepared
 from slamdepth.geometry import invert
+from slamdepth.io.tree import Tree
+from slamdepth.mapping.map_keyframe import MapKeyframe
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapstore import Map, Session
 from slamdepth.stopwatch import Stopwatch
@@ -22,7 +25,7 @@ from slamdepth.thread_limits import single_threaded
 from slamdepth.tracking.atlas import Atlas
 from slamdepth.tracking.finish import finish_run
 from slamdepth.tracking.frame_log import check_frame
-from slamdepth.tracking.map_parts import RunParts
+from slamdepth.tracking.map_parts import RunParts, StoredKeyframes
 from slamdepth.tracking.map_tracker import MapTracker, Placed
 from slamdepth.tracking.saved_maps import MapInfo, load_map, save_map
 from slamdepth.tracking.status import STATUS
@@ -76,6 +79,7 @@ class Tracker:
         self._steps = 0
         self._last_time_s = -np.inf
         self._finished = False
+        self._is_complete = False
         _load_libraries()
 
     def _new_map(self, id_: int) -> MapTracker:
@@ -185,6 +189,59 @@ class Tracker:
             moving_share=None if placed is None else placed.moving_share,
         )
 
+    @property
+    def is_quiet(self) -> bool:
+        """Whether nothing is under way that :meth:`state` does not hold; waits for work between frames."""
+        self._workers.between.wait()
+        return not self._finished and self._atlas.is_quiet
+
+    def state(self) -> Tree:
+        """Everything the tracker remembers, as arrays and plain values, while :attr:`is_quiet`.
+
+        A tracker of the same camera, model and settings that takes it by :meth:`restore` goes on as this one
+        would have. Images and predictions of keyframes are not in it.
+        """
+        self._workers.between.wait()
+        return {
+            "atlas": self._atlas.state(),
+            "steps": self._steps,
+            "last_time_s": self._last_time_s,
+            "is_complete": self._is_complete,
+            "earlier": [asdict(session) for session in self._earlier],
+            "watch": self._watch.state(),
+        }
+
+    def restore(self, state: Tree, stored: StoredKeyframes) -> None:
+        """Go on from what :meth:`state` gave; nothing was tracked yet.
+
+        Args:
+            stored: reads images and predictions of keyframes.
+        """
+        self._earlier = tuple(Session(**session) for session in state["earlier"])
+        self._atlas.restore(state["atlas"], stored)
+        self._steps, self._last_time_s = state["steps"], state["last_time_s"]
+        self._is_complete = state["is_complete"]
+        self._watch.restore(state["watch"])
+
+    @property
+    def keyframes(self) -> list[MapKeyframe]:
+        """All keyframes of this run, by map and number."""
+        return [
+            keyframe
+            for map_ in self._atlas.maps
+            for keyframe in map_.map.keyframes
+            if keyframe.session == map_.map.session
+        ]
+
+    def complete(self) -> None:
+        """Complete what waits after the last frame; :meth:`finish` does so too."""
+        self._workers.between.wait()
+        if not self._is_complete and self._active.map.keyframes:
+            self._is_complete = True
+            with single_threaded():
+                self._active.integration.run_all()
+                self._atlas.meet()
+
     def finish(self) -> Reconstruction:
         """Adjust each map, make it metric, and return the largest one with the pose of every frame in it.
 
@@ -201,8 +258,9 @@ class Tracker:
             raise TrackingError("no frame could be placed: too few features, or no depth")
         if not any(len(map_.frames) for map_ in self._atlas.maps):
             raise TrackingError("no frame could be placed in the map that the run goes on from")
-        self._finished = True
         self._watch.next_frame()
+        self.complete()
+        self._finished = True
         with self, single_threaded():
             return finish_run(self._atlas, self.config, self._watch, self._steps)
 
