@@ -10,7 +10,6 @@ from tracking_scene import CAMERA, CONFIG, COUNT, frames
 
 from slamdepth import Map, Reconstruction, Session, Tracker
 from slamdepth.depth.sensor import SensorDepth
-from slamdepth.tracking.saved_maps import MapInfo
 from slamdepth.types import Frame
 
 
@@ -22,8 +21,9 @@ def tracked(
     for frame in given:
         tracker.step(frame)
     result = tracker.finish()
-    info = MapInfo(Session("walk", "sensor"), {"sentence": "metric", "source": "sensor"}, with_images)
-    return tracker, result, tracker.saved_map(0, result, 1.0, info)
+    scale = {"sentence": "metric", "source": "sensor"}
+    saved = tracker.saved_map(0, result, Session("walk", "sensor"), scale, with_images=with_images)
+    return tracker, result, saved
 
 
 @lru_cache

@@ -191,9 +191,7 @@ def run_command(
     if sequence is None:
         from slamdepth.errors import ConfigError
 
-        raise ConfigError(
-            "name a video or the folder of a sequence: slamdepth run SEQ (see 'slamdepth run --help')"
-        )
+        raise ConfigError("Missing argument 'SEQ'. Usage: slamdepth run SEQ (see 'slamdepth run --help')")
     settings = _settings(
         config,
         {

@@ -35,7 +35,6 @@ from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.pipeline.steps import steps_of, steps_state
 from slamdepth.tracking import Tracker
 from slamdepth.types import DepthKind, DepthPrediction, Frame, StepResult
-from slamdepth.typing import Floats
 
 logger = logging.getLogger(__name__)
 
@@ -124,11 +123,9 @@ class Checkpoints:
         state = tracker.state()
         keyframes = tracker.keyframes
         new = [
-            (keyframe.frame.index, keyframe.prediction)
-            for keyframe in keyframes
-            if keyframe.prediction is not None
-            and not keyframe.prediction.is_sensor
-            and keyframe.frame.index not in self._depths
+            (frame.index, stored)
+            for frame, stored in keyframes
+            if stored is not None and not stored.is_sensor and frame.index not in self._depths
         ]
         now = progress()
         tree = {
@@ -203,15 +200,14 @@ class Checkpoints:
         self._pool.shutdown(wait=True)
 
 
-def _recent(keyframes: list[Any]) -> Tree:
+def _recent(keyframes: list[tuple[StoredFrame, StoredPrediction | None]]) -> Tree:
     """The depth of keyframes as it is, by frame."""
     kept = {}
-    for keyframe in keyframes:
-        stored = keyframe.prediction
+    for frame, stored in keyframes:
         if stored is None or stored.is_sensor or not stored.is_kept:
             continue
         prediction = stored.load()
-        kept[str(keyframe.frame.index)] = {"values": prediction.values, "sigma_log": prediction.sigma_log}
+        kept[str(frame.index)] = {"values": prediction.values, "sigma_log": prediction.sigma_log}
     return kept
 
 
@@ -284,16 +280,12 @@ class SequenceKeyframes:
             raise DatasetError(f"{path}: is damaged: it is shorter than the checkpoint says")
         self._latest = latest
 
-    def frame(self, index: int, gravity: Floats | None) -> Callable[[], Frame]:
-        """See :class:`StoredKeyframes`."""
-        del gravity  # the sequence has it
-        return lambda: read_sound(self._dataset, index, with_depth=self._with_depth)[0]
+    def read_frame(self, index: int) -> Frame:
+        """A frame of the sequence."""
+        return read_sound(self._dataset, index, with_depth=self._with_depth)[0]
 
-    def prediction(self, frame: StoredFrame) -> Callable[[], DepthPrediction]:
-        """See :class:`StoredKeyframes`."""
-        return lambda: self._prediction(frame)
-
-    def _prediction(self, frame: StoredFrame) -> DepthPrediction:
+    def read_prediction(self, frame: StoredFrame) -> DepthPrediction:
+        """The depth that was predicted for a keyframe."""
         from slamdepth.depth.sensor import SensorDepth
 
         recent = self._latest.recent.get(str(frame.index))

@@ -242,7 +242,7 @@ def _prepare(
     latest = None if begun is None else begun.latest
     if latest is not None and isinstance(tracker, Tracker):
         stored = SequenceKeyframes(dataset, folder.path, latest, with_depth=is_sensor(model))
-        tracker.restore(latest.tracker, stored)
+        tracker.restore(latest.tracker, stored.read_frame, stored.read_prediction)
     return _Job(options, config, dataset, indices, folder, model, scale, tracker, start_map, latest)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from functools import partial
 
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features, ScaleLevels
@@ -57,6 +57,19 @@ class RunParts:
     watch: Stopwatch
     wide_features: Callable[[Frame], Features]
     grows_maps: bool = True
+
+
+@dataclass(frozen=True)
+class StoredKeyframes:
+    """Reads images and predictions of keyframes that an earlier process made.
+
+    Attributes:
+        read_frame: reads a frame of the sequence by its index.
+        read_prediction: reads the prediction that was made for a frame.
+    """
+
+    read_frame: Callable[[int], Frame]
+    read_prediction: Callable[[StoredFrame], DepthPrediction]
 
 
 class MapParts:
@@ -138,10 +151,10 @@ class MapParts:
         sessions = state["keyframes"]["session"]
 
         def read(number: int, frame: StoredFrame) -> Callable[[], DepthPrediction] | None:
-            return stored.prediction(frame) if sessions[number] == session else None
+            return partial(stored.read_prediction, frame) if sessions[number] == session else None
 
         def frame_of(number: int, index: int, timestamp_s: float, gravity: Floats | None) -> StoredFrame:
-            reader = stored.frame(index, gravity) if sessions[number] == session else None
+            reader = partial(stored.read_frame, index) if sessions[number] == session else None
             return StoredFrame.of_saved(index, timestamp_s, self._run.camera, gravity, reader)
 
         states = keyframe_states(state["keyframes"], metric_of(state["metric"]), frame_of, read)
@@ -159,15 +172,3 @@ class MapParts:
         self.view_change.restore(state["view_change"])
         self.integration.restore(state["integration"])
         self.relocaliser.restore(state["relocaliser"])
-
-
-class StoredKeyframes(Protocol):
-    """Images and predictions of keyframes that an earlier process made."""
-
-    def frame(self, index: int, gravity: Floats | None) -> Callable[[], Frame]:
-        """What reads a frame of the sequence."""
-        ...
-
-    def prediction(self, frame: StoredFrame) -> Callable[[], DepthPrediction]:
-        """What reads the prediction that was made for a frame."""
-        ...

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from slamdepth.frontend.features import Features
 from slamdepth.frontend.preparation import Preparation, Prepared
 from slamdepth.geometry import invert
 from slamdepth.io.tree import Tree
-from slamdepth.mapping.map_keyframe import MapKeyframe
+from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapstore import Map, Session
 from slamdepth.stopwatch import Stopwatch
@@ -31,7 +33,7 @@ from slamdepth.tracking.saved_maps import MapInfo, load_map, save_map
 from slamdepth.tracking.status import STATUS
 from slamdepth.tracking.wide_features import WideFeatures
 from slamdepth.tracking.workers import DepthWorker, Workers
-from slamdepth.types import Camera, Frame, StepResult, TrackingStatus
+from slamdepth.types import Camera, DepthPrediction, Frame, StepResult, TrackingStatus
 
 
 class Tracker:
@@ -108,13 +110,25 @@ class Tracker:
         """Whether a map of the finished run holds the one that the run goes on from; 0 is the largest."""
         return self._atlas.finished[number].is_loaded
 
-    def saved_map(self, number: int, result: Reconstruction, factor: float, info: MapInfo) -> Map:
+    def saved_map(
+        self,
+        number: int,
+        result: Reconstruction,
+        session: Session,
+        scale: Mapping[str, Any],
+        *,
+        factor: float = 1.0,
+        with_images: bool = False,
+    ) -> Map:
         """A map of the finished run as plain data, to be written to disk.
 
         Args:
             number: of the map, 0 for the one that :meth:`finish` returned, 1 for the first of its others.
             result: what was made of it.
+            session: the recording that was tracked.
+            scale: what is known of the scale, as in ``report.json``.
             factor: by which its lengths were multiplied since :meth:`finish`.
+            with_images: keep the keyframes' images.
         """
         tracked = self._atlas.finished[number]
         if factor != 1.0:
@@ -123,6 +137,7 @@ class Tracker:
         if not tracked.is_loaded:
             tracked.map.begin_sessions()
         kept_s = frozenset(result.trajectory.timestamps_s.tolist())
+        info = MapInfo(session, scale, with_images)
         return save_map(tracked, self.camera, self.config.features, earlier, kept_s, info)
 
     @property
@@ -211,12 +226,19 @@ class Tracker:
             "watch": self._watch.state(),
         }
 
-    def restore(self, state: Tree, stored: StoredKeyframes) -> None:
+    def restore(
+        self,
+        state: Tree,
+        read_frame: Callable[[int], Frame],
+        read_prediction: Callable[[StoredFrame], DepthPrediction],
+    ) -> None:
         """Go on from what :meth:`state` gave; nothing was tracked yet.
 
         Args:
-            stored: reads images and predictions of keyframes.
+            read_frame: reads a frame that became a keyframe, by its index.
+            read_prediction: reads the depth that was predicted for it.
         """
+        stored = StoredKeyframes(read_frame, read_prediction)
         self._earlier = tuple(Session(**session) for session in state["earlier"])
         self._atlas.restore(state["atlas"], stored)
         self._steps, self._last_time_s = state["steps"], state["last_time_s"]
@@ -224,10 +246,10 @@ class Tracker:
         self._watch.restore(state["watch"])
 
     @property
-    def keyframes(self) -> list[MapKeyframe]:
-        """All keyframes of this run, by map and number."""
+    def keyframes(self) -> list[tuple[StoredFrame, StoredPrediction | None]]:
+        """Handles of all keyframes of this run, and of their depth, by map and number."""
         return [
-            keyframe
+            (keyframe.frame, keyframe.prediction)
             for map_ in self._atlas.maps
             for keyframe in map_.map.keyframes
             if keyframe.session == map_.map.session
