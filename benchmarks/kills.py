@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.command import errors_in_one_line, parser_of, progress_line
+from slamdepth.config import Config
 from slamdepth.io import read_tum_trajectory, write_json
 
 FILES = ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "mesh.ply")
@@ -63,9 +64,11 @@ def load_what_runs_load() -> None:
     for name in ("gtsam", "scipy.sparse", "scipy.spatial", "matplotlib.pyplot", "evo.core.metrics"):
         import_module(name)
 
+    from slamdepth.depth.registry import create_depth_model
     from slamdepth.frontend.compiled import load
     from slamdepth.open3d_loader import import_open3d
 
+    create_depth_model("sensor")  # imports the others as well
     load()
     import_open3d()
 
@@ -99,6 +102,7 @@ def kill_runs(
     from slamdepth.pipeline.run import run
 
     load_what_runs_load()
+    settings = Config.from_dict({"depth": {"name": depth}, "map": {"voxel_size_m": 0.05}})
     whole, folder = work / "whole", work / "killed"
     rng = random.Random(seed)
 
@@ -107,7 +111,7 @@ def kill_runs(
             run(
                 sequence,
                 place,
-                depth=depth,
+                config=settings,
                 max_frames=max_frames,
                 overwrite=True,
                 checkpoint_s=checkpoint_s,

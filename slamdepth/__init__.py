@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from slamdepth.mapstore import Map, Session
     from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage
     from slamdepth.pipeline.localize import Localisation, localize
+    from slamdepth.pipeline.merge import MergeResult, merge
     from slamdepth.pipeline.resume import resume
     from slamdepth.pipeline.run import run
     from slamdepth.tracking import CloudTracker, MapLocaliser, Tracker, create_tracker
@@ -81,6 +82,7 @@ _HOME = {
     "Localisation": "slamdepth.pipeline.localize",
     "Map": "slamdepth.mapstore",
     "MapLocaliser": "slamdepth.tracking",
+    "MergeResult": "slamdepth.pipeline.merge",
     "Mesh": "slamdepth.mapping.mesh",
     "OutputError": "slamdepth.errors",
     "PointCloud": "slamdepth.mapping.cloud",
@@ -109,6 +111,7 @@ _HOME = {
     "create_tracker": "slamdepth.tracking",
     "densify": "slamdepth.dense",
     "localize": "slamdepth.pipeline.localize",
+    "merge": "slamdepth.pipeline.merge",
     "open_dataset": "slamdepth.datasets",
     "read_tum_trajectory": "slamdepth.io",
     "resume": "slamdepth.pipeline.resume",
@@ -141,6 +144,7 @@ __all__ = [
     "Localisation",
     "Map",
     "MapLocaliser",
+    "MergeResult",
     "Mesh",
     "OutputError",
     "PointCloud",
@@ -170,6 +174,7 @@ __all__ = [
     "create_tracker",
     "densify",
     "localize",
+    "merge",
     "open_dataset",
     "read_tum_trajectory",
     "resume",

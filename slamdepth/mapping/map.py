@@ -388,6 +388,12 @@ class Map(MapView):
         for state in self._states:
             state.session = 0
 
+    def renumber_sessions(self, first: int) -> None:
+        """The recordings follow behind ``first`` others from now on."""
+        self.session += first
+        for state in self._states:
+            state.session += first
+
     @property
     def compact_at(self) -> int:
         """Number of landmarks that the next :meth:`compact` waits for."""

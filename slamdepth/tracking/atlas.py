@@ -202,6 +202,24 @@ class Atlas:
                 return True
         return False
 
+    def add_loaded(self) -> MapTracker:
+        """An empty map beside the others, to be filled; it is the active one."""
+        self.active = self._new(self._started)
+        self._started += 1
+        self.maps.append(self.active)
+        return self.active
+
+    def join(self, other: MapTracker, meetings: list[Meeting]) -> bool:
+        """Make the active map and another one a single map, in the world frame of the older one.
+
+        Args:
+            meetings: of keyframes of the active map, which agree.
+
+        Returns:
+            False where they would not reproject as one map.
+        """
+        return self._join(other, meetings)
+
     def _join(self, other: MapTracker, meetings: list[Meeting]) -> bool:
         """Make the active map and another one a single map, in the world frame of the older one.
 
@@ -212,7 +230,7 @@ class Atlas:
         home.integration.run_all()
         similarity = max(meetings, key=lambda meeting: meeting.inliers).similarity
         if not home.integration.loops.may_join(other.map, meetings, similarity):
-            del self._meetings[other.id]
+            self._meetings.pop(other.id, None)
             return False
         log.info("maps %d and %d are joined; a metre of the former is %.3g of the latter",
                  home.id, other.id, similarity.scale)  # fmt: skip

@@ -26,11 +26,19 @@ class PastFrames:
     def __len__(self) -> int:
         return len(self._poses)
 
+    def count(self, session: int) -> int:
+        """Number of frames of a recording."""
+        return self._sessions.count(session)
+
     def add(self, timestamp_s: float, session: int, pose: AnchoredPose) -> None:
         """Remember one frame."""
         self._times_s.append(timestamp_s)
         self._sessions.append(session)
         self._poses.append(pose)
+
+    def renumber_sessions(self, first: int) -> None:
+        """The recordings follow behind ``first`` others from now on."""
+        self._sessions = [first + session for session in self._sessions]
 
     def absorb(self, other: PastFrames) -> None:
         """Take over the frames of another map."""

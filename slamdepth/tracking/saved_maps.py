@@ -68,13 +68,36 @@ def save_map(
         earlier: recordings that the map was made of before.
         kept_s: times of the frames that have a pose in the result.
     """
-    map_ = tracked.map
-    map_.compact(at_once=True)
     past = PastFrames()
     past.absorb(tracked.past)
     for timestamp_s, pose in tracked.frames.poses:
         if timestamp_s in kept_s:
-            past.add(timestamp_s, map_.session, pose)
+            past.add(timestamp_s, tracked.map.session, pose)
+    session = replace(info.session, frames=past.count(tracked.map.session))
+    return _saved(tracked, camera, features.model_dump(), (*earlier, session), past, info)
+
+
+def save_merged(tracked: MapParts, first: SavedMap, sessions: Sequence[Session]) -> SavedMap:
+    """Maps that were loaded and joined as plain data.
+
+    Args:
+        first: the one whose camera, features and scale the joined one has.
+        sessions: of all.
+    """
+    info = MapInfo(sessions[0], first.scale)
+    return _saved(tracked, first.camera, first.features, sessions, tracked.past, info)
+
+
+def _saved(
+    tracked: MapParts,
+    camera: Camera,
+    features: Mapping[str, Any],
+    sessions: Sequence[Session],
+    past: PastFrames,
+    info: MapInfo,
+) -> SavedMap:
+    map_ = tracked.map
+    map_.compact(at_once=True)
     loops = tracked.integration.loops
     gravity = tracked.integration.gravity.state()
     groups: dict[str, Mapping[str, NDArray[Any]]] = {
@@ -91,12 +114,11 @@ def save_map(
     }
     if info.with_images:
         groups["images"] = _images(map_)
-    frames = int(np.count_nonzero(groups["frames"]["session"] == map_.session))
     return SavedMap(
         camera=camera,
         is_measured=map_.is_measured,
-        sessions=(*earlier, replace(info.session, frames=frames)),
-        features=features.model_dump(),
+        sessions=tuple(sessions),
+        features=dict(features),
         metric=metric_state(map_.keyframes[0].features.metric),
         vocabulary_sha256=vocabulary_sha256(loops.places.vocabulary),
         shutter=(tracked.shutter.readout_s, tracked.shutter.sigma_s),
