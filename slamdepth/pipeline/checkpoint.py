@@ -147,6 +147,13 @@ class Checkpoints:
             self._finish_writing()
         spent_s = time.monotonic() - start_s
         self.spent_s += spent_s
+        logger.debug(
+            "checkpoint after %d frames: %.0f ms, %.1f MB; %.1f s in all",
+            now.done,
+            1e3 * spent_s,
+            1e-6 * len(data),
+            self.spent_s,
+        )
         self._next_s = time.monotonic() + max(self._every_s, spent_s / _SHARE)
 
     def _finish_writing(self) -> None:
