@@ -37,6 +37,9 @@ _STAGES = (
 )
 
 
+_IN_A_ROW = 4  # kills of one run, so that many runs begin and end
+
+
 def in_a_child(work: Callable[[], None], kill_after_s: float | None) -> tuple[int, float]:
     """Do something in a forked process; returns its exit code, negative by a signal, and its seconds."""
     start_s = time.monotonic()
@@ -73,9 +76,13 @@ def load_what_runs_load() -> None:
     import_open3d()
 
 
-def stage_of(folder: Path) -> str:
-    """What a killed run was doing, by the files it left."""
-    return next((stage for name, stage in _STAGES if (folder / name).exists()), "opening")
+def stage_of(folder: Path, began: float) -> str:
+    """What a run that began at that time was doing when it was killed, by the files it wrote."""
+    for name, stage in _STAGES:
+        file = folder / name
+        if file.exists() and file.stat().st_mtime >= began:
+            return stage
+    return "opening"
 
 
 def compare(folder: Path, whole: Path) -> dict[str, Any]:
@@ -133,11 +140,14 @@ def kill_runs(
         shutil.rmtree(folder, ignore_errors=True)
         task, in_a_row = begin(folder, every_s), 0
         while True:
-            code, took_s = in_a_child(task, rng.uniform(0.0, whole_s) if len(killed) < kills else None)
+            is_deadly = len(killed) < kills and in_a_row < _IN_A_ROW
+            began = time.time()
+            code, took_s = in_a_child(task, rng.uniform(0.0, whole_s) if is_deadly else None)
             if code != -signal.SIGKILL:
                 break
             in_a_row += 1
-            killed.append({"after_s": round(took_s, 2), "during": stage_of(folder), "frames": _saved(folder)})
+            stage = stage_of(folder, began)
+            killed.append({"after_s": round(took_s, 2), "during": stage, "frames": _saved(folder)})
             progress_line(f"kill {len(killed)}: {killed[-1]}")
             if (folder / "checkpoint" / "run.json").is_file():
                 task = go_on
