@@ -39,9 +39,13 @@ if TYPE_CHECKING:
     from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
     from slamdepth.mapping.mesh import Mesh
     from slamdepth.mapping.reconstruction import Reconstruction
+    from slamdepth.mapstore import Map, Session
     from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage
+    from slamdepth.pipeline.localize import Localisation, localize
+    from slamdepth.pipeline.merge import MergeResult, merge
+    from slamdepth.pipeline.resume import resume
     from slamdepth.pipeline.run import run
-    from slamdepth.tracking import CloudTracker, Tracker, create_tracker
+    from slamdepth.tracking import CloudTracker, MapLocaliser, Tracker, create_tracker
     from slamdepth.types import (
         Camera,
         DepthKind,
@@ -75,6 +79,10 @@ _HOME = {
     "ImageMatcher": "slamdepth.frontend.features",
     "InputError": "slamdepth.errors",
     "Keyframe": "slamdepth.mapping.keyframe",
+    "Localisation": "slamdepth.pipeline.localize",
+    "Map": "slamdepth.mapstore",
+    "MapLocaliser": "slamdepth.tracking",
+    "MergeResult": "slamdepth.pipeline.merge",
     "Mesh": "slamdepth.mapping.mesh",
     "OutputError": "slamdepth.errors",
     "PointCloud": "slamdepth.mapping.cloud",
@@ -86,6 +94,7 @@ _HOME = {
     "RunResult": "slamdepth.pipeline",
     "RunStage": "slamdepth.pipeline",
     "RunStatistics": "slamdepth.types",
+    "Session": "slamdepth.mapstore",
     "SlamdepthError": "slamdepth.errors",
     "StepResult": "slamdepth.types",
     "StoredDenseDepth": "slamdepth.mapping.dense_depth",
@@ -101,8 +110,11 @@ _HOME = {
     "create_depth_model": "slamdepth.depth.registry",
     "create_tracker": "slamdepth.tracking",
     "densify": "slamdepth.dense",
+    "localize": "slamdepth.pipeline.localize",
+    "merge": "slamdepth.pipeline.merge",
     "open_dataset": "slamdepth.datasets",
     "read_tum_trajectory": "slamdepth.io",
+    "resume": "slamdepth.pipeline.resume",
     "run": "slamdepth.pipeline.run",
     "score_trajectory": "slamdepth.evaluation",
     "write_tum_trajectory": "slamdepth.io",
@@ -129,6 +141,10 @@ __all__ = [
     "ImageMatcher",
     "InputError",
     "Keyframe",
+    "Localisation",
+    "Map",
+    "MapLocaliser",
+    "MergeResult",
     "Mesh",
     "OutputError",
     "PointCloud",
@@ -140,6 +156,7 @@ __all__ = [
     "RunResult",
     "RunStage",
     "RunStatistics",
+    "Session",
     "SlamdepthError",
     "StepResult",
     "StoredDenseDepth",
@@ -156,8 +173,11 @@ __all__ = [
     "create_depth_model",
     "create_tracker",
     "densify",
+    "localize",
+    "merge",
     "open_dataset",
     "read_tum_trajectory",
+    "resume",
     "run",
     "score_trajectory",
     "write_tum_trajectory",

@@ -21,6 +21,8 @@ from slamdepth.cli import (
     eval_depth,
     evaluate,
     evaluate_mesh,
+    localize,
+    merge,
     run,
     scale,
     synth,
@@ -42,6 +44,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("run")(run.run_command)
+app.command("localize")(localize.localize_command)
+app.command("merge")(merge.merge_command)
 app.command("scale")(scale.scale_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)

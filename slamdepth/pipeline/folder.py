@@ -14,6 +14,8 @@ from pathlib import Path
 
 from slamdepth.errors import OutputError
 from slamdepth.io import writable, write_text
+from slamdepth.mapstore import remove_map
+from slamdepth.pipeline import checkpoint
 
 FILES = {
     "trajectory.txt": "every frame placed in the largest map, after optimisation (TUM, camera to world)",
@@ -31,6 +33,11 @@ FILES = {
     "README.txt": "this list, and the command for the same run again",
 }
 """What each file of a run folder holds."""
+
+MAP = "map"
+"""Folder of the map, for ``slamdepth localize --map`` and ``slamdepth run --map``."""
+
+MAP_CONTENT = "keyframes, landmarks, places and graph, for 'slamdepth localize --map' and 'run --map'"
 
 MAPS = "maps/"
 """Folder of the maps that never met the largest one: ``maps/2/``, ``maps/3/``, ..."""
@@ -80,7 +87,7 @@ class RunFolder:
                 raise OutputError(f"{path}: is a file; name a folder for the results")
             if not (path.is_dir() and any(path.iterdir())):
                 return cls(writable(path))
-            if not _is_run(path):
+            if not is_run(path):
                 raise OutputError(f"{path}: is not empty and holds no earlier run; name a new folder")
         except OSError as error:
             raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -103,7 +110,8 @@ class RunFolder:
             with writing(self.path):
                 self._remove_files()
         width = max(map(len, FILES))
-        lines = [f"{name:<{width}}  {what}" for name, what in {**FILES, MAPS: MAPS_CONTENT}.items()]
+        listed = {**FILES, f"{MAP}/": MAP_CONTENT, MAPS: MAPS_CONTENT}
+        lines = [f"{name:<{width}}  {what}" for name, what in listed.items()]
         head = f"{_MARK}. A file that is missing was not asked for, or the run was killed before it.\n\n"
         if arguments:
             command = shlex.join(["slamdepth", "run", *arguments, "--config", str(self.path / "config.yaml")])
@@ -133,6 +141,8 @@ class RunFolder:
         """Remove our files; folders of maps only where nothing else is in them, and never through a link."""
         for name in FILES:
             (self.path / name).unlink(missing_ok=True)
+        remove_map(self.path / MAP)
+        checkpoint.remove(self.path)
         maps = self.path / MAPS
         if maps.is_symlink() or not maps.is_dir():
             return
@@ -140,6 +150,7 @@ class RunFolder:
             if folder.name.isdecimal() and folder.is_dir() and not folder.is_symlink():
                 for name in _MAP_FILES:
                     (folder / name).unlink(missing_ok=True)
+                remove_map(folder / MAP)
                 _remove_if_empty(folder)
         _remove_if_empty(maps)
 
@@ -168,21 +179,25 @@ def run_log() -> Iterator[logging.handlers.MemoryHandler]:
             target.close()
 
 
-def write_log_to(buffer: logging.handlers.MemoryHandler, path: Path) -> None:
+def write_log_to(buffer: logging.handlers.MemoryHandler, path: Path, *, goes_on: bool = False) -> None:
     """Write the messages so far and all later ones to ``path``.
+
+    Args:
+        goes_on: behind those of an earlier process.
 
     Raises:
         OutputError: ``path`` cannot be written.
     """
     with writing(path):
-        file = logging.FileHandler(path, mode="w", encoding="utf-8")
+        file = logging.FileHandler(path, mode="a" if goes_on else "w", encoding="utf-8")
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
     buffer.setTarget(file)
     buffer.flush()
     buffer.flushLevel = logging.DEBUG  # from now on line by line, so that a killed run leaves its log
 
 
-def _is_run(path: Path) -> bool:
+def is_run(path: Path) -> bool:
+    """Whether a folder holds a run, finished or not."""
     try:
         return (path / _README).read_text(encoding="utf-8").startswith(_MARK)
     except (OSError, UnicodeDecodeError):

@@ -14,17 +14,18 @@ from functools import partial
 
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
+from slamdepth.io.tree import Tree
 from slamdepth.loops.look_alikes import View, fits
 from slamdepth.loops.meeting import Meeting, Meetings, find_meeting
 from slamdepth.mapping.map_keyframe import MapKeyframe
-from slamdepth.tracking.map_tracker import MapTracker, Placed
+from slamdepth.tracking.map_parts import StoredKeyframes
+from slamdepth.tracking.map_tracker import FEWEST_FRAMES, MapTracker, Placed
 from slamdepth.types import Frame
 
 log = logging.getLogger(__name__)
 
 _PATIENCE_S = 1.0  # that a map waits for the camera to return
 _FIRST_WAIT_S = 0.1  # after the second young map that fails in a row; doubled by each further one
-_FEWEST_FRAMES = 10  # a smaller map is not kept: nothing has confirmed its poses
 _LOOKED_AT = 2  # maps that a frame or a keyframe is looked for in: those with the most similar places
 
 
@@ -39,6 +40,7 @@ class Atlas:
         active: the one that the camera is in, or was in last.
         joined: how often two maps became one.
         dropped_frames: frames of maps that were not kept.
+        finished: the maps of the result, the largest first; empty before the end.
     """
 
     def __init__(self, make: Callable[[int], MapTracker], config: Config) -> None:
@@ -49,6 +51,7 @@ class Atlas:
         self.maps.append(self.active)
         self.joined = 0
         self.dropped_frames = 0
+        self.finished: tuple[MapTracker, ...] = ()
         self._started = 1
         self._failed = 0  # young maps in a row that the camera was lost in
         self._lost_since_s: float | None = None
@@ -69,9 +72,43 @@ class Atlas:
             placed = self._find(frame, raw) or self._start(frame, raw)
         if placed is not None:
             self._lost_since_s = None
-        if len(self.active.frames) >= _FEWEST_FRAMES:
+        if self.active.is_worth_keeping:
             self._failed = 0
         return placed
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether all maps wait for nothing, so that :meth:`state` is all there is to know."""
+        return bool(self.active.map.keyframes) and all(map_.integration.is_quiet for map_ in self.maps)
+
+    def state(self) -> Tree:
+        """Everything the maps remember, for a checkpoint; they must be quiet."""
+        by_id = {map_.id: map_ for map_ in self.maps}
+        return {
+            "maps": [map_.state() for map_ in self.maps],
+            "active": self.maps.index(self.active),
+            "counts": [self.joined, self.dropped_frames, self._started, self._failed],
+            "lost_since_s": self._lost_since_s,
+            "meetings": {str(k): found.state() for k, found in self._meetings.items() if k in by_id},
+        }
+
+    def restore(self, state: Tree, stored: StoredKeyframes) -> None:
+        """Go on from what :meth:`state` gave.
+
+        Args:
+            stored: reads images and predictions.
+        """
+        self.maps = []
+        for one in state["maps"]:
+            map_ = self._new(one["id"])
+            map_.restore(one, stored)
+            self.maps.append(map_)
+        self.active = self.maps[state["active"]]
+        self.joined, self.dropped_frames, self._started, self._failed = state["counts"]
+        self._lost_since_s = state["lost_since_s"]
+        by_id = {map_.id: map_ for map_ in self.maps}
+        for k, found in state["meetings"].items():
+            self._meetings[int(k)].restore(found, self.active.map, by_id[int(k)].map)
 
     def _find(self, frame: Frame, raw: Features) -> Placed | None:
         """Look for the place of a lost frame in the other maps."""
@@ -104,7 +141,7 @@ class Atlas:
 
     def _patience_s(self) -> float:
         """How long the active map waits for the camera; a young one that fails may have started badly."""
-        if len(self.active.frames) >= _FEWEST_FRAMES:
+        if self.active.is_worth_keeping:
             return _PATIENCE_S
         return 0.0 if self._failed == 0 else min(_PATIENCE_S, _FIRST_WAIT_S * 2.0 ** (self._failed - 1))
 
@@ -112,7 +149,7 @@ class Atlas:
         """Go on in another map; the one before is dropped where it is too small to be of use."""
         before = self.active
         before.leave()
-        if len(before.frames) < _FEWEST_FRAMES:
+        if not before.is_worth_keeping:
             self._failed += 1
             self.dropped_frames += len(before.frames)
             self.maps.remove(before)
@@ -165,6 +202,24 @@ class Atlas:
                 return True
         return False
 
+    def add_loaded(self) -> MapTracker:
+        """An empty map beside the others, to be filled; it is the active one."""
+        self.active = self._new(self._started)
+        self._started += 1
+        self.maps.append(self.active)
+        return self.active
+
+    def join(self, other: MapTracker, meetings: list[Meeting]) -> bool:
+        """Make the active map and another one a single map, in the world frame of the older one.
+
+        Args:
+            meetings: of keyframes of the active map, which agree.
+
+        Returns:
+            False where they would not reproject as one map.
+        """
+        return self._join(other, meetings)
+
     def _join(self, other: MapTracker, meetings: list[Meeting]) -> bool:
         """Make the active map and another one a single map, in the world frame of the older one.
 
@@ -175,7 +230,7 @@ class Atlas:
         home.integration.run_all()
         similarity = max(meetings, key=lambda meeting: meeting.inliers).similarity
         if not home.integration.loops.may_join(other.map, meetings, similarity):
-            del self._meetings[other.id]
+            self._meetings.pop(other.id, None)
             return False
         log.info("maps %d and %d are joined; a metre of the former is %.3g of the latter",
                  home.id, other.id, similarity.scale)  # fmt: skip
@@ -194,6 +249,6 @@ class Atlas:
     def by_size(self) -> list[MapTracker]:
         """The maps to keep, the one with most frames first; never none."""
         ranked = sorted(self.maps, key=lambda map_: -len(map_.frames))
-        kept = [map_ for map_ in ranked if len(map_.frames) >= _FEWEST_FRAMES] or ranked[:1]
+        kept = [map_ for map_ in ranked if len(map_.frames) >= FEWEST_FRAMES] or ranked[:1]
         self.dropped_frames += sum(len(map_.frames) for map_ in ranked[len(kept) :])
         return kept

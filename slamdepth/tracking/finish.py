@@ -51,7 +51,7 @@ class FinalMap:
 
 
 def finish_run(atlas: Atlas, config: Config, watch: Stopwatch, steps: int) -> Reconstruction:
-    """Finish all maps of a run that are kept.
+    """Finish all maps of a run that are kept; no keyframe waits.
 
     Args:
         steps: frames given to the tracker.
@@ -59,9 +59,8 @@ def finish_run(atlas: Atlas, config: Config, watch: Stopwatch, steps: int) -> Re
     Returns:
         The largest map, with the others that never met it.
     """
-    atlas.active.integration.run_all()
-    atlas.meet()
     kept = atlas.by_size()
+    atlas.finished = tuple(kept)
     atlas.active = kept[0]
     *others, largest = (_finish_map(tracked, config, watch, steps) for tracked in reversed(kept))
     notes = list(largest.notes)
@@ -97,7 +96,8 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
         readout_sigma_s=shutter.sigma_s,
         scale_votes=final.scale_votes,
     )
-    in_time = sorted(map_.keyframes, key=lambda keyframe: keyframe.frame.timestamp_s)
+    of_this_run = [keyframe for keyframe in map_.keyframes if keyframe.session == map_.session]
+    in_time = sorted(of_this_run, key=lambda keyframe: keyframe.frame.timestamp_s)
     seen = map_.seen_by(2)
     rows = np.full(map_.size + 1, -1)  # the last is that of no landmark
     rows[seen] = np.arange(len(seen))
@@ -123,12 +123,21 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
 
 
 def optimise_map(tracked: MapTracker, config: Config) -> FinalMap:
-    """Global bundle adjustment and metric scale."""
-    map_, integration, shutter = tracked.map, tracked.integration, tracked.shutter
+    """Global bundle adjustment and metric scale.
+
+    A map that goes on from a saved one keeps that one's scale, and needs no other start. Its keypoints are
+    not aligned: images of the saved keyframes may be gone, and one landmark has one reference.
+    """
+    map_, integration, shutter, is_loaded = (
+        tracked.map, tracked.integration, tracked.shutter, tracked.is_loaded,
+    )  # fmt: skip
     notes: list[str] = []
     is_adjusted = config.bundle.final and len(map_.keyframes) >= 3
-    is_other = is_adjusted and _adjust_all(map_, integration, tracked.frames, shutter)
-    if is_adjusted and config.bundle.align and align_keypoints(map_, shutter, tracked.localiser.levels):
+    is_other = is_adjusted and _adjust_all(
+        map_, integration, tracked.frames, shutter, from_two_starts=not is_loaded
+    )
+    if is_adjusted and config.bundle.align and not is_loaded:
+        align_keypoints(map_, shutter, tracked.localiser.levels)
         every = [keyframe.id for keyframe in map_.keyframes]
         integration.adjuster.adjust(every, [], map_.seen_by(2), _ALIGNED_STEPS)
     if is_other:
@@ -141,13 +150,21 @@ def optimise_map(tracked: MapTracker, config: Config) -> FinalMap:
     dropped = integration.mapper.dropped
     if dropped:
         notes.append(f"{dropped} predicted depth maps disagreed with the map and were not used")
-    return FinalMap(tuple(notes), () if map_.is_measured else _make_metric(map_))
+    return FinalMap(tuple(notes), () if map_.is_measured or is_loaded else _make_metric(map_))
 
 
 def _adjust_all(
-    map_: Map, integration: KeyframeIntegration, frames: FrameLog, shutter: RollingShutter
+    map_: Map,
+    integration: KeyframeIntegration,
+    frames: FrameLog,
+    shutter: RollingShutter,
+    *,
+    from_two_starts: bool,
 ) -> bool:
     """Adjust everything, search again for what the better map predicts to be seen, and adjust once more.
+
+    Args:
+        from_two_starts: also try another start.
 
     Returns:
         Whether another start was better, see :mod:`slamdepth.backend.resection`.
@@ -157,7 +174,8 @@ def _adjust_all(
     _follow_motion(frames, shutter)
     adjuster.adjust(every, [], map_.seen_by(2), (3, 5))
     # a sensor's depth leaves no bad start to be found
-    is_other = not map_.is_measured and adjuster.adjust_from_two_starts(every, map_.seen_by(2), _OTHER_START)
+    may_be_bad = from_two_starts and not map_.is_measured
+    is_other = may_be_bad and adjuster.adjust_from_two_starts(every, map_.seen_by(2), _OTHER_START)
     for n in range(_PASSES):
         before_s = shutter.readout_s
         if shutter.is_estimated:
