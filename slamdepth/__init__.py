@@ -13,7 +13,7 @@ from slamdepth._version import __version__
 
 if TYPE_CHECKING:
     from slamdepth.config import Config
-    from slamdepth.datasets import Dataset, open_dataset
+    from slamdepth.datasets import Dataset, ReadOptions, open_dataset
     from slamdepth.dense import DenseEffort, densify
     from slamdepth.depth.base import DepthModel
     from slamdepth.depth.registry import create_depth_model
@@ -79,6 +79,7 @@ _HOME = {
     "OutputError": "slamdepth.errors",
     "PointCloud": "slamdepth.mapping.cloud",
     "Prepared": "slamdepth.frontend.preparation",
+    "ReadOptions": "slamdepth.datasets",
     "Reconstruction": "slamdepth.mapping.reconstruction",
     "RelativeError": "slamdepth.evaluation",
     "RunInterrupted": "slamdepth.pipeline",
@@ -133,6 +134,7 @@ __all__ = [
     "OutputError",
     "PointCloud",
     "Prepared",
+    "ReadOptions",
     "Reconstruction",
     "RelativeError",
     "RunInterrupted",

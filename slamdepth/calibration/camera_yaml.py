@@ -60,7 +60,31 @@ def read_camera(path: str | Path, make: Callable[..., _Camera], notes: list[str]
             type, or no camera has such intrinsics; names the file, the key and the allowed ones.
     """
     path = Path(path)
-    values = as_opencv(path, _load(path))
+    return make_camera(path, _load(path), make, notes)
+
+
+def read_values(path: Path) -> dict[Any, Any]:
+    """The keys of a calibration file, for those that hold several cameras; see :func:`make_camera`.
+
+    Raises:
+        CameraError: the file cannot be read, or is no YAML with keys.
+    """
+    return _load(path)
+
+
+def make_camera(
+    path: Path, values: dict[Any, Any], make: Callable[..., _Camera], notes: list[str] | None = None
+) -> _Camera:
+    """The camera of what :func:`read_camera` reads of a file, or of a recording that holds the same.
+
+    Args:
+        path: names it in messages.
+        values: the keys of a ``camera.yaml``, or of another tool's calibration.
+
+    Raises:
+        CameraError: as :func:`read_camera`.
+    """
+    values = as_opencv(path, values)
     foreign = is_calibration(values)
     camera = _made(path, translated(path, values) if foreign else values, make)
     try:

@@ -34,6 +34,11 @@ class Dataset(Protocol):
         timestamps_s: ``(N,)`` float64 seconds, strictly increasing.
         has_depth: True where sensor depth can be read.
         ground_truth: poses of the camera, or None.
+        truth_source: what ``ground_truth`` is where it was not measured by a second system, such as a
+            scanner's own poses; empty elsewhere.
+        imu_path: inertial data of the same time, as ``--imu`` reads them; None where there are none.
+        layout: name of the reader that opened it; empty where none did.
+        is_live: True where frames come as they are taken: ``len`` grows, and only the next frame can be read.
         notes: what was guessed, dropped or repaired while reading, one line each.
     """
 
@@ -44,6 +49,10 @@ class Dataset(Protocol):
     timestamps_s: NDArray[np.float64]
     has_depth: bool
     ground_truth: Trajectory | None
+    truth_source: str = ""
+    imu_path: Path | None = None
+    layout: str = ""
+    is_live: bool = False
     notes: list[str]
 
     def __len__(self) -> int: ...

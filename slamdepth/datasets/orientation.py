@@ -93,6 +93,14 @@ def turned_image(image: NDArray[_Scalar], orientation: int) -> NDArray[_Scalar]:
     return np.ascontiguousarray(upright)
 
 
+def turned_rotation(orientation: int) -> NDArray[np.float64]:
+    """``T_upright_stored (4, 4)``, from the frame of a camera whose pixels are stored so to that of upright
+    ones; of orientations that are not mirrored."""
+    T = np.eye(4)
+    T[:2, :2] = _AXES[orientation]
+    return T
+
+
 def fitted_camera(
     path: Path, shape: tuple[int, ...], camera: Camera, orientation: int, notes: list[str]
 ) -> Camera:

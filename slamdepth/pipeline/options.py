@@ -3,12 +3,17 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from slamdepth.datasets import Dataset
+from slamdepth.datasets.options import ReadOptions
 from slamdepth.errors import ConfigError, SlamdepthError
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.types import TrackingStatus, Trajectory
@@ -26,6 +31,7 @@ class RunOptions:
         stride: take every Nth frame.
         mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
+        reading: how the sequence is opened, such as the topic of a bag.
 
     Raises:
         ConfigError: ``stride`` or ``max_frames`` is below 1.
@@ -38,9 +44,20 @@ class RunOptions:
     stride: int = 1
     mesh: bool = True
     overwrite: bool = False
+    reading: ReadOptions = field(default_factory=ReadOptions)
 
     def __post_init__(self) -> None:
         check_frames_asked(self.stride, self.max_frames)
+
+    def indices_of(self, dataset: Dataset) -> range:
+        """Which frames of ``dataset`` are read, in order; of a live source, all that there may ever be."""
+        if dataset.is_live:
+            return self.indices(sys.maxsize)
+        times_s = dataset.timestamps_s
+        if self.reading.seconds is None or not len(times_s):
+            return self.indices(len(dataset))
+        end_s = float(times_s[0]) + self.reading.seconds
+        return self.indices(int(np.searchsorted(times_s, end_s, side="right")))
 
     def indices(self, frames: int) -> range:
         """Which of ``frames`` frames are read, in order."""

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slamdepth.config import Config, merge
-from slamdepth.datasets import Dataset, open_dataset
+from slamdepth.datasets import Dataset, ReadOptions, open_dataset
 from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.metric import configured_model, with_chosen_model
@@ -58,6 +58,7 @@ def run(
     stride: int = 1,
     mesh: bool = True,
     overwrite: bool = False,
+    reading: ReadOptions | None = None,
     progress: ProgressCallback | None = None,
     stop: threading.Event | None = None,
 ) -> RunResult:
@@ -67,7 +68,8 @@ def run(
     generators of Python, NumPy, OpenCV and, where it is loaded, torch are seeded from ``config.seed``.
 
     Args:
-        sequence: a video, a folder of images, or a folder in the layout of TUM RGB-D or 7-Scenes.
+        sequence: a video, a folder of images or of a known layout, a bag, or a live source such as
+            ``camera:0`` or an address of RTSP; docs/inputs.md lists all.
         output: run folder. Default: ``runs/<sequence>-<time>``.
         depth: name of the depth model, see :func:`slamdepth.create_depth_model`; ``"sensor"`` takes the
             sequence's own depth. Default: as ``config`` says, which is ``"auto"`` unless changed.
@@ -77,6 +79,7 @@ def run(
         stride: take every Nth frame.
         mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
+        reading: how the sequence is opened, such as the topic of a bag.
         progress: called after each frame and at the start of each stage.
         stop: set it, from any thread or a signal handler, to finish early with the frames tracked so far.
 
@@ -97,6 +100,7 @@ def run(
         stride,
         mesh,
         overwrite,
+        reading or ReadOptions(),
     )
     settings = _settings(config, depth)
     tell = progress or (lambda state: None)
@@ -145,8 +149,8 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     from slamdepth.tracking import create_tracker
 
     config = with_chosen_model(config)
-    dataset = open_dataset(options.sequence, options.camera_file)
-    indices = options.indices(len(dataset))
+    dataset = open_dataset(options.sequence, options.camera_file, options.reading)
+    indices = options.indices_of(dataset)
     check_scale_options(dataset, config, indices)
     folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite)
     seed_everything(config.seed)
@@ -310,6 +314,7 @@ def _reported_options(options: RunOptions, tracked: Tracked) -> dict[str, object
     asked = asdict(options)
     for name in ("sequence", "output", "overwrite", "camera_file"):
         asked.pop(name)
+    asked["reading"] = {name: value for name, value in asked["reading"].items() if value}
     return {**asked, "camera_file": options.camera_file is not None, "interrupted": tracked.interrupted}
 
 
@@ -322,6 +327,7 @@ def _arguments(options: RunOptions) -> list[str]:
         arguments += ["--max-frames", str(options.max_frames)]
     if options.stride != 1:
         arguments += ["--stride", str(options.stride)]
+    arguments += options.reading.arguments()
     return arguments if options.mesh else [*arguments, "--no-mesh"]
 
 
