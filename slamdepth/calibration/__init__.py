@@ -8,10 +8,13 @@ from __future__ import annotations
 
 from slamdepth.calibration.camera_yaml import CAMERA_FILE, camera_yaml, read_camera, what_to_write
 from slamdepth.calibration.plausible import Pinhole, check_plausible
+from slamdepth.calibration.wide_lens import WIDE_MODELS, WideLens
 
 __all__ = [
     "CAMERA_FILE",
+    "WIDE_MODELS",
     "Pinhole",
+    "WideLens",
     "camera_yaml",
     "check_plausible",
     "read_camera",

@@ -13,6 +13,7 @@ from typing import Protocol, TypeVar
 
 from slamdepth.datasets.base import Dataset
 from slamdepth.datasets.video import VIDEO_ENDINGS
+from slamdepth.datasets.virtual_view import through_view
 from slamdepth.errors import DatasetError
 from slamdepth.registry import Registry
 from slamdepth.types import Camera
@@ -83,6 +84,8 @@ def known_readers() -> tuple[Reader, ...]:
 def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dataset:
     """Open a sequence, whatever its layout.
 
+    Frames of a wide lens are pinhole views, see :class:`slamdepth.datasets.virtual_view.VirtualView`.
+
     Args:
         path: the folder, or a video file.
         camera_file: a ``camera.yaml`` that overrules what the folder says or is known for.
@@ -104,7 +107,7 @@ def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dat
         for reader in readers:
             if reader.matches(path):
                 _log.info("%s: reading as layout '%s'", path, reader.name)
-                dataset = reader.open(path, camera)
+                dataset = through_view(reader.open(path, camera))
                 dataset.notes[:0] = camera_notes
                 for note in dataset.notes:
                     _log.info("%s: %s", dataset.name, note)
