@@ -15,10 +15,13 @@ from slamdepth.calibration.camera_yaml import (
     what_to_write,
 )
 from slamdepth.calibration.plausible import Pinhole, check_plausible
+from slamdepth.calibration.wide_lens import WIDE_MODELS, WideLens
 
 __all__ = [
     "CAMERA_FILE",
+    "WIDE_MODELS",
     "Pinhole",
+    "WideLens",
     "camera_yaml",
     "check_plausible",
     "make_camera",

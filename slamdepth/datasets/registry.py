@@ -16,6 +16,7 @@ from slamdepth.datasets.confinement import check_confined, refuse_archive
 from slamdepth.datasets.intrinsics import CameraSource, Certainty
 from slamdepth.datasets.options import ReadOptions
 from slamdepth.datasets.video import VIDEO_ENDINGS
+from slamdepth.datasets.virtual_view import through_view
 from slamdepth.errors import DatasetError
 from slamdepth.registry import Registry
 from slamdepth.types import Camera
@@ -101,6 +102,8 @@ def open_dataset(
 ) -> Dataset:
     """Open a sequence, whatever its layout.
 
+    Frames of a wide lens are pinhole views, see :class:`slamdepth.datasets.virtual_view.VirtualView`.
+
     Args:
         path: a folder, a video, a bag, a pattern of images such as ``img_*.png``, or a live source:
             ``camera:0``, or an address of RTSP or HTTP.
@@ -154,7 +157,8 @@ def _opened(reader: Reader, path: Path, camera: Camera | None, options: ReadOpti
         dataset = reader.open_with(path, camera, options)
     else:
         dataset = reader.open(path, camera)
-    dataset.layout = reader.name
     if not options.follow_links:
         check_confined(dataset)
+    dataset = through_view(dataset)
+    dataset.layout = reader.name
     return dataset

@@ -19,6 +19,7 @@ from slamdepth.datasets.image_files import IMAGE_ENDINGS, list_images, read_imag
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics, find_camera_file, intrinsics_of
 from slamdepth.datasets.orientation import fitted_camera
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
+from slamdepth.datasets.virtual_view import as_pinhole
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.training.data import fingerprint
@@ -178,8 +179,8 @@ class _VideoSource:
             self.notes.append(note)
 
     def _read(self, index: int, decode: Callable[[], NDArray[np.uint8]]) -> tuple[Frame, Intrinsics]:
-        frame = Frame(index, index / self._video.fps, decode(), self._intrinsics.camera)
-        return frame, self._intrinsics
+        frame = as_pinhole(Frame(index, index / self._video.fps, decode(), self._intrinsics.camera))
+        return frame, replace(self._intrinsics, camera=frame.camera)
 
 
 class _PairSource:
