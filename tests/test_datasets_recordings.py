@@ -339,3 +339,27 @@ def test_malformed_files_are_named_with_their_line(
         open_dataset(folder)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_tum_vi_has_a_wide_lens_and_is_seen_as_by_a_pinhole(tmp_path: Path) -> None:
+    folder = made.make_euroc(tmp_path / "dataset-room1_512_16", "mocap0")
+    (folder / "mav0" / "cam0" / "sensor.yaml").unlink()
+    for image in (folder / "mav0" / "cam0" / "data").iterdir():
+        write_image(image, np.full((512, 512), 40000, np.uint16))
+    T_camera_body = np.linalg.inv(poses(1, 3)[0]).tolist()
+    (folder / "dso").mkdir()
+    (folder / "dso" / "camchain.yaml").write_text(
+        f"cam0:\n  T_cam_imu: {json.dumps(T_camera_body)}\n  cam_overlaps: [1]\n  camera_model: pinhole\n"
+        "  distortion_coeffs: [0.00348238, 0.00071503, -0.00205323, 0.00020293]\n"
+        "  distortion_model: equidistant\n"
+        "  intrinsics: [190.97847715, 190.97330705, 254.93170606, 256.89744280]\n"
+        "  resolution: [512, 512]\n  rostopic: /cam0/image_raw\n"
+    )
+    dataset = open_dataset(folder)
+    assert dataset.layout == "euroc"
+    assert not dataset.camera.is_distorted
+    assert dataset.imu_path is not None
+    check_truth(dataset)
+    image = dataset.read(0).image_rgb
+    assert image.shape[:2] == (dataset.camera.height, dataset.camera.width)
+    assert int(image[image.shape[0] // 2, image.shape[1] // 2, 0]) == 40000 >> 8

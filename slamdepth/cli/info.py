@@ -45,11 +45,15 @@ def info_command(
     from slamdepth.datasets.summary import summarise
 
     options = ReadOptions(topic, depth_topic, pose_topic, follow_links)
-    summary = summarise(open_dataset(sequence, camera, options))
+    dataset = open_dataset(sequence, camera, options)
+    try:
+        summary = summarise(dataset)
+    finally:
+        dataset.close()
     if as_json:
         from slamdepth.io.text import json_text
 
-        typer.echo(json_text({"input": str(sequence), **summary.to_dict()}), nl=False)
+        typer.echo(json_text(summary.to_dict()), nl=False)
         return
     _print(summary, quiet)
 

@@ -69,8 +69,17 @@ class Dataset(Protocol):
             IndexError: there is no frame ``index``.
             ImageDecodeError: the image, or the depth image asked for, does not decode.
             CameraError: the size of either is not the camera's.
+            SourceEnded: a live source gives no more frames.
         """
         ...
+
+    def close(self) -> list[str]:
+        """Release what is held open, such as a camera; nothing can be read afterwards from a live source.
+
+        Returns:
+            What happened while it was read, one line each.
+        """
+        return []
 
     def __iter__(self) -> Iterator[Frame]:
         """Every frame in order, with sensor depth where there is any; see :meth:`frames`."""

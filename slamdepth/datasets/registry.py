@@ -11,6 +11,7 @@ import logging
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
+from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.base import Dataset
 from slamdepth.datasets.confinement import check_confined, refuse_archive
 from slamdepth.datasets.intrinsics import CameraSource, Certainty
@@ -131,7 +132,7 @@ def open_dataset(
         if camera_file is not None:
             camera = Camera.from_file(Path(camera_file).expanduser(), camera_notes)
         if found is not None:
-            _log.info("%s: reading as layout '%s'", path, found.name)
+            _log.info("%s: reading as layout '%s'", without_secret(str(path)), found.name)
             dataset = _opened(found, path, camera, options)
             if camera_file is not None:
                 dataset.camera_source = CameraSource(Certainty.GIVEN, "--camera")

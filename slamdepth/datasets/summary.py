@@ -12,7 +12,7 @@ import numpy as np
 from slamdepth.datasets.base import Dataset, read_sound
 from slamdepth.datasets.intrinsics import Certainty
 from slamdepth.datasets.sensor_depth import check_sensor_depth
-from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
+from slamdepth.errors import CameraError, DatasetError, ImageDecodeError, SourceEnded
 from slamdepth.types import Frame
 
 _SAMPLES = 7
@@ -107,7 +107,7 @@ def _first_frames(dataset: Dataset, problems: list[str]) -> list[Frame]:
             return frames
         try:
             frames.append(dataset.read(index))
-        except (ImageDecodeError, EOFError) as error:
+        except (ImageDecodeError, SourceEnded) as error:
             problems.append(str(error))
             return frames
     return frames

@@ -150,6 +150,10 @@ class ViewedSequence(Dataset):
     def __len__(self) -> int:
         return len(self.raw)
 
+    def close(self) -> list[str]:
+        """See :meth:`slamdepth.datasets.base.Dataset.close`."""
+        return self.raw.close()
+
     def read(self, index: int, *, with_depth: bool = False) -> Frame:
         """Read one frame; see :meth:`slamdepth.datasets.base.Dataset.read`."""
         frame = as_pinhole(self.raw.read(index, with_depth=with_depth))

@@ -15,6 +15,7 @@ import numpy as np
 
 from slamdepth.config import Config, merge
 from slamdepth.datasets import Dataset, ReadOptions, open_dataset
+from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.metric import configured_model, with_chosen_model
@@ -185,10 +186,9 @@ def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threadin
         if job.scale.fit is not None:
             write_scale(folder / "depth_scale.yaml", job.scale.fit)
         logger.info(
-            "%s: %d of %d frames, depth by %s, %s features",
+            "%s: %s, depth by %s, %s features",
             dataset.path,
-            len(job.indices),
-            len(dataset),
+            "a live source" if dataset.is_live else f"{len(job.indices)} of {len(dataset)} frames",
             job.model.name,
             config.features.name if config.odometry == "orb" else "no",
         )
@@ -320,7 +320,7 @@ def _reported_options(options: RunOptions, tracked: Tracked) -> dict[str, object
 
 def _arguments(options: RunOptions) -> list[str]:
     """What the command line was given, without the settings and the run folder."""
-    arguments = [str(options.sequence)]
+    arguments = [without_secret(str(options.sequence))]
     if options.camera_file is not None:
         arguments += ["--camera", str(options.camera_file)]
     if options.max_frames is not None:
@@ -335,7 +335,7 @@ def _settings_text(options: RunOptions, config: Config) -> str:
     camera = "none" if options.camera_file is None else Path(options.camera_file).name
     lines = [
         "# The settings of this run; 'slamdepth run SEQ --config' reads them back. These are not read back:",
-        f"# sequence: {Path(options.sequence).name}, --camera: {camera}",
+        f"# sequence: {Path(without_secret(str(options.sequence))).name}, --camera: {camera}",
         f"# stride: {options.stride}, max frames: {options.max_frames}, mesh: {options.mesh}",
         "# For the same run again, give them again; README.txt has the command.",
     ]

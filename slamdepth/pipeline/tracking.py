@@ -22,6 +22,9 @@ from slamdepth.types import Frame, StepResult
 
 logger = logging.getLogger(__name__)
 
+_ENDLESS = 10**12
+"""More frames than any recording has."""
+_FEWEST_JUDGED = 40
 _WARNINGS = 5  # images named one by one before only their number is logged
 
 
@@ -83,8 +86,15 @@ def track(
     skipped = 0
     map_id = 0
     start_s: float | None = None
-    total = len(indices)
-    reader = FramePrefetcher(dataset, indices, with_depth=with_depth, prepare=tracker.prepare)
+    # A live source has no length, and what is read ahead of it would be late.
+    total = 0 if len(indices) > _ENDLESS else len(indices)
+    reader = FramePrefetcher(
+        dataset,
+        indices,
+        with_depth=with_depth,
+        prepare=tracker.prepare,
+        capacity=1 if dataset.is_live else 8,
+    )
     progress(RunProgress(RunStage.TRACKING, 0, total))
     with reader, TrajectoryWriter(online_path) as online:
         for item in reader:
@@ -93,7 +103,7 @@ def track(
             if isinstance(item, ImageDecodeError):
                 skipped += 1
                 _warn(item, skipped)
-                if 2 * skipped > total:
+                if 2 * skipped > (total or max(_FEWEST_JUDGED, skipped + len(steps))):
                     raise DatasetError(
                         f"{dataset.path}: more than half of the images do not decode "
                         f"({skipped} of the first {skipped + len(steps)}); the last: {item}"
@@ -111,9 +121,12 @@ def track(
                     )
                 online.append(result.timestamp_s, result.T_world_camera)
             progress(_state(result, len(steps) + skipped, total, len(steps), start_s))
+    source_notes = dataset.close() if dataset.is_live else []
     if start_s is None:
         if stop.is_set():
             raise RunInterrupted("interrupted before the first frame; nothing was saved")
+        if reader.ended:
+            raise DatasetError(reader.ended)
         raise DatasetError(f"{dataset.path}: none of the {total} images decodes")
 
     done = len(steps) + skipped
@@ -129,10 +142,15 @@ def track(
         "decode": 1e3 * reader.read_s / max(1, len(steps)),
     }
     notes: list[str] = []
-    if done < total:
-        notes.append(f"interrupted after {done} of {total} frames")
+    interrupted = stop.is_set() and (done < total or not total)
+    if interrupted:
+        notes.append(
+            f"interrupted after {done} of {total} frames" if total else f"stopped after {done} frames"
+        )
+    notes += [reader.ended] if reader.ended else []
+    notes += source_notes
     if skipped:
-        notes.append(f"{skipped} of {total} images do not decode or are missing, and were skipped")
+        notes.append(f"{skipped} of {total or done} images do not decode or are missing, and were skipped")
     if reader.broken_depth_images:
         notes.append(f"{reader.broken_depth_images} depth images do not decode and were left out")
     for note in notes:
@@ -149,7 +167,7 @@ def track(
         tuple(steps),
         len(steps) / (end_s - start_s),
         skipped,
-        done < total,
+        interrupted,
         tuple(notes),
     )
 
