@@ -168,3 +168,17 @@ def encoded(image: NDArray[Any], ending: str) -> bytes:
     ok, data = cv2.imencode(ending, image)
     assert ok
     return data.tobytes()
+
+
+def small_bag(path: Path, kind: str) -> Path:
+    """Four images with their camera and depth, and poses."""
+    from sequences import CAMERA, depth_raw, image_rgb
+
+    with BagWriter(path, kind) as bag:
+        for i in range(4):
+            time_s = 100.0 + 0.1 * i
+            bag.write("/cam/image_raw", bag.image(time_s, "optical", image_rgb(i), "rgb8"), time_s)
+            bag.write("/cam/camera_info", bag.camera_info(time_s, "optical", CAMERA), time_s)
+            bag.write("/cam/depth_registered", bag.image(time_s, "optical", depth_raw(i), "16UC1"), time_s)
+            bag.write("/pose", bag.pose(time_s, "world", np.eye(4)), time_s)
+    return path

@@ -268,6 +268,24 @@ def make_nerfstudio(folder: Path, **changed: Any) -> Path:
     return folder
 
 
+def make_polycam(folder: Path) -> Path:
+    """A raw export that Polycam has optimised; depth of half the image's size."""
+    for i, T in enumerate(known_poses() @ OPENGL):
+        for kind in ("", "corrected_"):
+            write_image(
+                folder / "keyframes" / f"{kind}images" / f"{1000 + i}.jpg", np.zeros((12, 16, 3), np.uint8)
+            )
+        data = png(image_rgb(i))  # the bytes tell what they are, not the name
+        (folder / "keyframes" / "corrected_images" / f"{1000 + i}.jpg").write_bytes(data)
+        write_image(folder / "keyframes" / "depth" / f"{1000 + i}.png", depth_raw(i)[:6, :8])
+        lens = {"fx": 20.0, "fy": 21.0, "cx": 7.5, "cy": 5.5, "width": 16, "height": 12, "blur_score": 90.5}
+        pose = {f"t_{row}{column}": T[row, column] for row in range(3) for column in range(4)}
+        cameras = folder / "keyframes" / "corrected_cameras"
+        cameras.mkdir(exist_ok=True)
+        (cameras / f"{1000 + i}.json").write_text(json.dumps({**lens, **pose, "timestamp": 1000 + i}))
+    return folder
+
+
 def make_colmap(folder: Path, *, binary: bool, below: str = "sparse/0") -> Path:
     """A workspace of one OPENCV camera; COLMAP's numbers of images are not in their order."""
     model = folder / below

@@ -253,6 +253,16 @@ def test_transforms_with_a_lens_for_each_frame_and_names_without_ending(tmp_path
     assert any("fl_x is 20.0 to 23.0" in note for note in dataset.notes)
 
 
+def test_polycam(tmp_path: Path) -> None:
+    dataset = open_dataset(made.make_polycam(tmp_path / "export"))
+    assert dataset.layout == "polycam"
+    check_images(dataset)
+    check_camera(dataset)
+    check_truth(dataset)
+    np.testing.assert_allclose(depth_of(dataset, 1)[::2, ::2], depth_raw(1)[:6, :8] / 1000.0, rtol=1e-6)
+    assert "ARKit" in dataset.truth_source
+
+
 @pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize("below", ["sparse/0", "sparse"])
 def test_colmap(tmp_path: Path, binary: bool, below: str) -> None:
@@ -281,7 +291,7 @@ def test_a_pattern_takes_the_images_that_it_fits_in_natural_order(tmp_path: Path
 
 def test_every_layout_has_a_reader_and_says_what_it_needs() -> None:
     names = [reader.name for reader in known_readers()]
-    assert len(names) >= 15  # and folders of images
+    assert len(names) >= 17  # and folders of images
     assert all(reader.needs for reader in known_readers())
 
 
@@ -293,6 +303,7 @@ LAYOUTS: dict[str, Callable[[Path], Path]] = {
     "nerfstudio": made.make_nerfstudio,
     "colmap": lambda folder: made.make_colmap(folder, binary=True),
     "stray": made.make_stray,
+    "polycam": made.make_polycam,
 }
 
 
@@ -360,6 +371,6 @@ def test_tum_vi_has_a_wide_lens_and_is_seen_as_by_a_pinhole(tmp_path: Path) -> N
     assert not dataset.camera.is_distorted
     assert dataset.imu_path is not None
     check_truth(dataset)
-    image = dataset.read(0).image_rgb
-    assert image.shape[:2] == (dataset.camera.height, dataset.camera.width)
-    assert int(image[image.shape[0] // 2, image.shape[1] // 2, 0]) == 40000 >> 8
+    seen = dataset.read(0).image_rgb
+    assert seen.shape[:2] == (dataset.camera.height, dataset.camera.width)
+    assert int(seen[seen.shape[0] // 2, seen.shape[1] // 2, 0]) == 40000 >> 8
