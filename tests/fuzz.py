@@ -65,14 +65,19 @@ class FindingError(Exception):
     """A case ended in neither an error of one line nor a sound result."""
 
 
-def run_case(target: Target, number: int, seed: int, folder: Path) -> None:
-    """Run one case in a folder that is empty.
+def run_case(target: Target, number: int, seed: int, good: tuple[Path, Path], folder: Path) -> None:
+    """Run one case.
+
+    Args:
+        good: a folder, and what ``target.make`` returned for it; not changed.
+        folder: absent yet; takes the damaged copy.
 
     Raises:
         FindingError: it ended in what it must not end in.
     """
     rng = random.Random(f"{target.name} {number} {seed}")
-    path = target.make(folder)
+    shutil.copytree(good[0], folder)
+    path = folder / good[1].relative_to(good[0])
     for _ in range(rng.choice((1, 1, 1, 2, 5))):
         _damage(folder, rng)
     try:
@@ -183,7 +188,7 @@ def _lines(data: bytes, change: Callable[[list[bytes]], None]) -> bytes:
 
 
 def _drop_line(data: bytes, rng: random.Random) -> bytes:
-    return _lines(data, lambda lines: None if not lines else lines.pop(rng.randrange(len(lines))) and None)
+    return _lines(data, lambda lines: lines.__delitem__(rng.randrange(len(lines))))
 
 
 def _repeat_line(data: bytes, rng: random.Random) -> bytes:
@@ -268,13 +273,13 @@ def _read_config(path: Path) -> None:
 def _read_scale(path: Path) -> None:
     from slamdepth.depth.scale_file import read_scale
 
-    _require(bool(np.isfinite(read_scale(path).scale)), "a finite scale")
+    _require(bool(np.isfinite(read_scale(path).scale.scale)), "a finite scale")
 
 
 def _read_surface(path: Path) -> None:
     from slamdepth.evaluation.surface_file import read_surface
 
-    _require(bool(np.isfinite(read_surface(path).vertices).all()), "finite vertices")
+    _require(bool(np.isfinite(read_surface(path).vertices_m).all()), "finite vertices")
 
 
 def _read_head(path: Path) -> None:
@@ -358,7 +363,6 @@ def targets(*, slow: bool = True) -> list[Target]:
     plain += "distortion: [0.1, 0, 0, 0, 0]\n"
     orb = "%YAML:1.0\nCamera.type: PinHole\nCamera.fx: 500.0\nCamera.fy: 500.0\nCamera.cx: 320\n"
     orb += "Camera.cy: 240\nCamera.width: 640\nCamera.height: 480\nCamera.k1: 0.1\nCamera.fps: 30\n"
-    scale = "kind: slamdepth-depth-scale\nmodel: dinov2\nscale: 1.2\n"
     settings = "seed: 1\ndepth:\n  name: dinov2\nmap:\n  voxel_size_m: 0.02\nscale:\n  camera_height_m: 1.5\n"
     found += [
         Target("trajectory", named("groundtruth.txt", tum), _read_trajectory),
@@ -369,11 +373,33 @@ def targets(*, slow: bool = True) -> list[Target]:
         Target("camera-kalibr", named("camera.yaml", kalibr), _read_camera),
         Target("camera-orbslam", named("camera.yaml", orb), _read_camera),
         Target("config", named("config.yaml", settings), _read_config),
-        Target("scale-file", named("scale.yaml", scale), _read_scale),
+        Target("scale-file", _scale, _read_scale),
     ]
     if slow:
         found += [Target("ply", _mesh, _read_surface), Target("weights", _head, _read_head)]
     return found
+
+
+def _scale(folder: Path) -> Path:
+    from slamdepth.depth.scale import DepthScale, ScaleDomain, ScaleFit
+    from slamdepth.depth.scale_file import write_scale
+    from slamdepth.types import DepthKind, WeightsInfo
+
+    fit = ScaleFit(
+        scale=DepthScale(1.2, 0.0, ScaleDomain.DEPTH),
+        sequence="room",
+        model="dinov2",
+        kind=DepthKind.METRIC,
+        weights=(WeightsInfo("head", "0" * 64, "rooms", "mine"),),
+        scale_sigma_log=0.01,
+        shift_sigma=None,
+        frames=10,
+        pixels=1000,
+        frame_spread_log=0.1,
+        sequence_id="abc",
+    )
+    write_scale(folder / "scale.yaml", fit)
+    return folder / "scale.yaml"
 
 
 def _mesh(folder: Path) -> Path:
@@ -402,14 +428,18 @@ def _work(name: str, numbers: list[int], seed: int, folder: Path, told: Any, at:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
     (target,) = (one for one in targets() if one.name == name)
-    for number in numbers:
-        at.value = number
-        with tempfile.TemporaryDirectory(dir=folder) as place:
+    with tempfile.TemporaryDirectory(dir=folder) as place:
+        good = Path(place) / "good"
+        good.mkdir()
+        path = target.make(good)
+        for number in numbers:
+            at.value = number
+            damaged = Path(place) / f"{number}"
             try:
-                run_case(target, number, seed, Path(place))
+                run_case(target, number, seed, (good, path), damaged)
             except FindingError as finding:
                 told.put((name, number, str(finding)))
-    at.value = -1
+            shutil.rmtree(damaged, ignore_errors=True)
 
 
 def main(arguments: list[str] | None = None) -> int:
