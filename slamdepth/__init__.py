@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         InputError,
         OutputError,
         SlamdepthError,
+        SourceEnded,
         TrackingError,
         WeightsError,
     )
@@ -88,6 +89,7 @@ _HOME = {
     "RunStage": "slamdepth.pipeline",
     "RunStatistics": "slamdepth.types",
     "SlamdepthError": "slamdepth.errors",
+    "SourceEnded": "slamdepth.errors",
     "StepResult": "slamdepth.types",
     "StoredDenseDepth": "slamdepth.mapping.dense_depth",
     "StoredFrame": "slamdepth.mapping.keyframe_store",
@@ -143,6 +145,7 @@ __all__ = [
     "RunStage",
     "RunStatistics",
     "SlamdepthError",
+    "SourceEnded",
     "StepResult",
     "StoredDenseDepth",
     "StoredFrame",

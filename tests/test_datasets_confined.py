@@ -82,6 +82,24 @@ def test_a_colmap_model_that_names_images_elsewhere_is_refused(tmp_path: Path, o
         open_dataset(folder)
 
 
+@pytest.mark.parametrize("layout", ["icl", "record3d", "stray"])
+def test_images_that_are_links_out_of_other_layouts_are_refused(tmp_path: Path, layout: str) -> None:
+    if layout == "icl":
+        folder, _ = made.make_icl_own(tmp_path / "room")
+        path = folder / "scene_00_0001.png"
+    elif layout == "record3d":
+        folder = made.make_record3d(tmp_path / "room", packed=False)
+        path = folder / "rgbd" / "1.jpg"
+    else:
+        folder = made.make_stray(tmp_path / "room")
+        path = folder / "rgb.mp4"
+    shutil.move(path, tmp_path / path.name)
+    path.symlink_to(tmp_path / path.name)
+    with pytest.raises(DatasetError, match="leads out of the sequence"):
+        open_dataset(folder)
+    assert len(open_dataset(folder, options=FOLLOW)) == 4
+
+
 def test_the_command_line_can_follow_links(tmp_path: Path, outside: Path) -> None:
     folder = make_tum(tmp_path / "room")
     (folder / "rgb" / "0.png").unlink()

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -72,6 +72,10 @@ class Dataset(Protocol):
             SourceEnded: a live source gives no more frames.
         """
         ...
+
+    def files(self) -> Iterable[Path]:
+        """The images and depth images that it reads, where they are files of their own."""
+        return ()
 
     def close(self) -> list[str]:
         """Release what is held open, such as a camera; nothing can be read afterwards from a live source.

@@ -12,8 +12,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from slamdepth.datasets.base import Dataset
-from slamdepth.datasets.recording import FileRecording
-from slamdepth.datasets.sequence import ImageSequence
 from slamdepth.errors import DatasetError
 
 _ARCHIVES = (".zip", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tar.xz", ".tar.zst", ".7z", ".rar")
@@ -25,9 +23,7 @@ def check_confined(dataset: Dataset) -> None:
     Raises:
         DatasetError: one does; names it and where it leads to.
     """
-    if isinstance(dataset, ImageSequence | FileRecording):
-        depth = (path for path in dataset.depth_paths if path is not None)
-        check_inside(dataset.path, (*dataset.image_paths, *depth))
+    check_inside(dataset.path, dataset.files())
 
 
 def check_inside(folder: Path, paths: Iterable[Path]) -> None:

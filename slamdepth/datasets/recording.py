@@ -7,7 +7,7 @@ layout has them: of a pinhole camera, not larger than tracking needs, with depth
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,7 @@ class Recording(Dataset):
         truth: poses of the camera.
         notes: takes a line for each assumption.
         source: where ``camera`` comes from; None: the files of the recording.
+        files: what ``image`` and ``depth`` read, where they are files of their own.
     """
 
     def __init__(
@@ -56,8 +57,9 @@ class Recording(Dataset):
         truth: Trajectory | None = None,
         notes: Sequence[str] = (),
         source: CameraSource | None = None,
+        files: Sequence[Path] = (),
     ) -> None:
-        self.name, self.path = name, path
+        self.name, self.path, self._files = name, path, files
         self.notes = [*notes]
         self.timestamps_s = timestamps_s
         self.ground_truth = truth
@@ -71,6 +73,10 @@ class Recording(Dataset):
 
     def __len__(self) -> int:
         return len(self.timestamps_s)
+
+    def files(self) -> Iterable[Path]:
+        """See :meth:`slamdepth.datasets.base.Dataset.files`."""
+        return self._files
 
     def read(self, index: int, *, with_depth: bool = False) -> Frame:
         """Read one frame; see :meth:`slamdepth.datasets.base.Dataset.read`.
@@ -155,6 +161,10 @@ class FileRecording(Recording):
         without = self.depth_paths.count(None)
         if is_there and without:
             self.notes.append(f"{without} of {len(self)} frames have no depth image")
+
+    def files(self) -> Iterable[Path]:
+        """See :meth:`slamdepth.datasets.base.Dataset.files`."""
+        return (*self.image_paths, *(path for path in self.depth_paths if path is not None))
 
     def _depth_of(self, index: int) -> Floats32 | None:
         path, confidence_path = self.depth_paths[index], self._confidence_paths[index]

@@ -152,6 +152,8 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     config = with_chosen_model(config)
     dataset = open_dataset(options.sequence, options.camera_file, options.reading)
     indices = options.indices_of(dataset)
+    if dataset.imu_path is not None and config.scale.imu is None:
+        dataset.notes.append(f"inertial data is there, for scale and gravity: --imu {dataset.imu_path}")
     check_scale_options(dataset, config, indices)
     folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite)
     seed_everything(config.seed)

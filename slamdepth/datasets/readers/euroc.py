@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from slamdepth.calibration import make_camera, read_values
+from slamdepth.calibration import read_values
 from slamdepth.calibration.dialects import number_of
 from slamdepth.datasets.image_files import list_images
 from slamdepth.datasets.poses import checked_pose
-from slamdepth.datasets.recording import FileRecording, camera_for
+from slamdepth.datasets.recording import FileRecording, camera_for, recorded_camera
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import check_overlap, first_image
 from slamdepth.errors import DatasetError
@@ -29,6 +29,8 @@ from slamdepth.typing import Floats
 
 _TRUTHS = ("state_groundtruth_estimate0/data.csv", "mocap0/data.csv")
 _CAMERA = "cam0"
+_USUAL = ("columns are read", "times are in nanoseconds")
+"""What is said of any file, but is so in every one of this layout."""
 
 
 @register_reader
@@ -47,7 +49,7 @@ class EurocReader:
         notes: list[str] = []
         timestamps_s, images = _list(root / _CAMERA)
         _, shape = first_image(tuple(images))
-        found = _found(root, whole, notes)
+        found = _found(root, whole, shape, notes)
         taken_by, source = camera_for(path, shape, camera, found.camera, found.how)
         truth = _truth(root, whole, timestamps_s, found, notes)
         recording = FileRecording(
@@ -95,11 +97,11 @@ def _list(folder: Path) -> tuple[Floats, list[Path]]:
     return np.array(times_ns, dtype=np.float64) / 1e9, [image for _, _, image in entries]
 
 
-def _found(root: Path, whole: Path, notes: list[str]) -> _Found:
+def _found(root: Path, whole: Path, shape: tuple[int, ...], notes: list[str]) -> _Found:
     sensor = root / _CAMERA / "sensor.yaml"
     if sensor.is_file():
         values = read_values(sensor)
-        camera = make_camera(sensor, values, Camera, notes)
+        camera = recorded_camera(sensor, values, shape, notes)
         return _Found(camera, "sensor.yaml of cam0", _matrix(sensor, values.get("T_BS")))
     chains = (whole / "dso" / "camchain.yaml", whole / "camchain.yaml")
     chain = next((one for one in chains if one.is_file()), None)
@@ -110,7 +112,8 @@ def _found(root: Path, whole: Path, notes: list[str]) -> _Found:
         raise DatasetError(f"{chain}: has no camera {_CAMERA}")
     T_camera_body = _matrix(chain, left.get("T_cam_imu"))
     T_body_camera = None if T_camera_body is None else invert(T_camera_body)
-    return _Found(make_camera(chain, left, Camera, notes), f"{_CAMERA} of {chain.name}", T_body_camera)
+    camera = recorded_camera(chain, left, shape, notes)
+    return _Found(camera, f"{_CAMERA} of {chain.name}", T_body_camera)
 
 
 def _matrix(path: Path, value: Any) -> Floats | None:
@@ -138,7 +141,7 @@ def _truth(
     if path is None:
         return None
     body, repairs = read_tum_trajectory(path, timestamps_s)
-    notes += [note for note in repairs if "columns are read" not in note]
+    notes += [note for note in repairs if not any(usual in note for usual in _USUAL)]
     check_overlap(timestamps_s, body, path)
     if found.T_body_camera is None:
         notes.append("ground truth is of the body: where the camera is on it is not known")

@@ -67,10 +67,12 @@ def _open_tum(path: Path, camera: Camera | None) -> FileRecording:
     _, shape = first_image(tuple(images))
     taken_by, source = camera_for(path, shape, camera, CAMERA, _HOW)
     times_s = np.array(numbers, dtype=np.float64) / CAMERA.fps
-    file = next(iter(sorted(path.glob(_TRUTH))), None)
+    files = sorted(path.glob(_TRUTH))
+    if len(files) > 1:
+        raise DatasetError(f"{path}: several ground truths: {', '.join(file.name for file in files)}")
     truth = None
-    if file is not None:
-        rows = {int(row[0]): row for row in read_matrix(file, 8) if np.isfinite(row).all()}
+    if files:
+        rows = {int(row[0]): row for row in read_matrix(files[0], 8) if np.isfinite(row).all()}
         found = [pose_of(rows[n][1:4], rows[n][4:]) if n in rows else None for n in numbers]
         truth = _mirrored(times_s, found, notes)
     recording = FileRecording(
@@ -133,6 +135,7 @@ def _open_own(path: Path, camera: Camera | None) -> Recording:
         truth=_mirrored(times_s, poses, notes),
         notes=notes,
         source=source,
+        files=images,
     )
     recording.truth_source = _SOURCE
     return recording

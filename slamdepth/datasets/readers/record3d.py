@@ -78,6 +78,7 @@ class Record3dReader:
             truth=meta.trajectory(numbers, times_s, notes),
             notes=notes,
             source=source,
+            files=[path / name for name in names] if path.is_dir() else (),
         )
         recording.truth_source = ARKIT if recording.ground_truth is not None else ""
         if recording.truth_source:

@@ -8,6 +8,7 @@ of 256x192 pixels with the video's view, and ``confidence/NNNNNN.png`` (0 to 2).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -115,6 +116,11 @@ class StraySequence(VideoSequence):
         if self._orientation != UPRIGHT:
             depth_m = turned_image(depth_m, self._orientation)
         return replace(frame, depth_m=resized_depth(depth_m, self.camera, str(path)))
+
+    def files(self) -> Iterable[Path]:
+        """See :meth:`slamdepth.datasets.base.Dataset.files`."""
+        depth = (self._depth_path(index) for index in range(len(self)))
+        return (self.path / _VIDEO, *(path for path in depth if is_file(path)))
 
     def _depth_path(self, index: int) -> Path:
         return self.path / "depth" / f"{index:06d}.png"

@@ -116,6 +116,8 @@ def open_source(path: Path, *, camera_file: Path | None, stride: int, max_frames
         return _VideoSource(VideoFile(path), camera_file, chosen)
     if path.suffix.lower() in IMAGE_ENDINGS:
         return _ImageSource(SourceKind.IMAGE, path, [path], camera_file)
+    if any(reader.matches(path) for reader in known_readers()):  # a bag, say
+        return _SequenceSource(open_dataset(path, camera_file), chosen)
     known = ", ".join(ending.removeprefix(".") for ending in (*IMAGE_ENDINGS, *VIDEO_ENDINGS))
     raise DatasetError(f"{path}: neither a folder nor an image nor a video by its ending; known are {known}")
 
