@@ -330,8 +330,8 @@ def targets(*, slow: bool = True) -> list[Target]:
         "polycam": folder_of(made.make_polycam),
         "colmap": folder_of(lambda folder: made.make_colmap(folder, binary=True)),
         "colmap-text": folder_of(lambda folder: made.make_colmap(folder, binary=False)),
-        "r3d": lambda folder: made.make_record3d(folder / "walk.r3d", packed=_has("liblzfse")),
-        "record3d": folder_of(lambda folder: made.make_record3d(folder, packed=_has("liblzfse"))),
+        "r3d": lambda folder: made.make_record3d(folder / "walk.r3d", packed=_has("lzfse")),
+        "record3d": folder_of(lambda folder: made.make_record3d(folder, packed=_has("lzfse"))),
         "video": lambda folder: made.make_stray(folder / "made") / "rgb.mp4",
     }
     if _has("rosbags"):

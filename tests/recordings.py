@@ -203,10 +203,10 @@ def record3d_files(*, packed: bool) -> dict[str, bytes]:
         files[f"rgbd/{i}.jpg"] = png(image_rgb(i))  # the bytes tell what they are, not the name
         files[f"rgbd/{i}.depth"], files[f"rgbd/{i}.conf"] = depth, confidence.tobytes()
         if packed:
-            import liblzfse
+            import lzfse
 
             for name in (f"rgbd/{i}.depth", f"rgbd/{i}.conf"):
-                files[name] = liblzfse.compress(files[name])
+                files[name] = lzfse.compress(files[name])
     return files
 
 

@@ -144,7 +144,7 @@ def test_scannet_sens(tmp_path: Path, kind: int) -> None:
 
 @pytest.mark.parametrize("name", ["walk.r3d", "unpacked"])
 def test_record3d(tmp_path: Path, name: str) -> None:
-    pytest.importorskip("liblzfse", reason="depth of Record3D is unpacked by the extra [record3d]")
+    pytest.importorskip("lzfse", reason="depth of Record3D is unpacked by the extra [record3d]")
     dataset = open_dataset(made.make_record3d(tmp_path / name))
     assert (dataset.layout, dataset.name) == ("record3d", name.removesuffix(".r3d"))
     check_images(dataset)
@@ -164,7 +164,7 @@ def test_record3d_without_the_package_has_no_depth_and_says_so(
 ) -> None:
     import sys
 
-    monkeypatch.setitem(sys.modules, "liblzfse", None)
+    monkeypatch.setitem(sys.modules, "lzfse", None)
     dataset = open_dataset(made.make_record3d(tmp_path / "walk.r3d", packed=False))
     assert not dataset.has_depth
     assert any("pip install 'slamdepth[record3d]'" in note for note in dataset.notes)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import threading
 import zipfile
-import zlib
 from pathlib import Path
 
 from slamdepth.errors import DatasetError
@@ -43,8 +42,10 @@ class Members:
         try:
             self._archive = zipfile.ZipFile(path)
             infos = self._archive.infolist()
-        except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError) as error:
-            raise DatasetError(f"{path}: this archive cannot be read (is it whole?): {error}") from error
+        except Exception as error:  # zipfile lets even IndexError out where an archive is damaged
+            raise DatasetError(
+                f"{path}: this archive cannot be read (is it whole?): {_line(error)}"
+            ) from error
         if len(infos) > _MOST_MEMBERS:
             raise DatasetError(f"{path}: this archive has {len(infos)} files, more than any recording")
         self.names = frozenset(info.filename for info in infos if not info.is_dir())
@@ -65,8 +66,12 @@ class Members:
                 # What the archive says of the size may be a lie: no more is unpacked than is asked for.
                 with self._lock, self._archive.open(name) as member:
                     data = member.read(largest + 1)
-        except (OSError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise DatasetError(f"{self.path}: {name} cannot be read: {error}") from error
+        except Exception as error:  # see above; also of zlib, LZMA and BZ2
+            raise DatasetError(f"{self.path}: {name} cannot be read: {_line(error)}") from error
         if len(data) > largest:
             raise DatasetError(f"{self.path}: {name} has more than {largest} bytes")
         return data
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -187,7 +187,7 @@ def _depths(
 ) -> Callable[[int], Floats32 | None] | None:
     if any(f"rgbd/{number}.depth" in members.names for number in numbers):
         try:
-            import liblzfse  # noqa: F401 - asked here whether it is there
+            import lzfse  # noqa: F401 - asked here whether it is there
         except ImportError:
             notes.append(
                 "depth is compressed by LZFSE and is left out; to read it: pip install 'slamdepth[record3d]'"
@@ -232,11 +232,11 @@ def _unpacked(members: Members, name: str) -> bytes:
     data = _read(members, name, _LARGEST_DEPTH)
     if not data.startswith(_LZFSE):
         return data
-    import liblzfse
+    import lzfse
 
     try:
-        unpacked = bytes(liblzfse.decompress(data))
-    except (liblzfse.error, ValueError, MemoryError) as error:
+        unpacked = bytes(lzfse.decompress(data))
+    except (lzfse.error, ValueError, MemoryError) as error:
         raise ImageDecodeError(f"{members.path}: {name} is damaged: {error}") from error
     if len(unpacked) > 4 * _MOST_PIXELS:
         raise ImageDecodeError(f"{members.path}: {name} unpacks to {len(unpacked)} bytes")

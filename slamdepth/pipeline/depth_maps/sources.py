@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from slamdepth.datasets import Dataset, known_readers, open_dataset
+from slamdepth.datasets import Dataset, ReadOptions, known_readers, open_dataset
 from slamdepth.datasets.image_files import IMAGE_ENDINGS, list_images, read_image_frame, short_names
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics, find_camera_file, intrinsics_of
 from slamdepth.datasets.orientation import fitted_camera
@@ -88,12 +88,20 @@ class Source(Protocol):
         ...
 
 
-def open_source(path: Path, *, camera_file: Path | None, stride: int, max_frames: int | None) -> Source:
+def open_source(
+    path: Path,
+    *,
+    camera_file: Path | None,
+    stride: int,
+    max_frames: int | None,
+    reading: ReadOptions | None = None,
+) -> Source:
     """Find out what ``path`` is and open it.
 
     Args:
         camera_file: a ``camera.yaml`` that overrules whatever else is known of the camera.
         stride, max_frames: every Nth image, and at most this many.
+        reading: how a sequence is opened.
 
     Raises:
         DatasetError: nothing is there, or nothing in it can be read.
@@ -104,7 +112,7 @@ def open_source(path: Path, *, camera_file: Path | None, stride: int, max_frames
     try:
         if path.is_dir():
             if any(reader.matches(path) for reader in known_readers()):
-                return _SequenceSource(open_dataset(path, camera_file), chosen)
+                return _SequenceSource(open_dataset(path, camera_file, reading), chosen)
             if (path / "camera.json").is_file():
                 return _PairSource(PairReader().open(path), camera_file, chosen)
             return _ImageSource(SourceKind.IMAGES, path, list_images(path)[chosen], camera_file)
@@ -117,7 +125,7 @@ def open_source(path: Path, *, camera_file: Path | None, stride: int, max_frames
     if path.suffix.lower() in IMAGE_ENDINGS:
         return _ImageSource(SourceKind.IMAGE, path, [path], camera_file)
     if any(reader.matches(path) for reader in known_readers()):  # a bag, say
-        return _SequenceSource(open_dataset(path, camera_file), chosen)
+        return _SequenceSource(open_dataset(path, camera_file, reading), chosen)
     known = ", ".join(ending.removeprefix(".") for ending in (*IMAGE_ENDINGS, *VIDEO_ENDINGS))
     raise DatasetError(f"{path}: neither a folder nor an image nor a video by its ending; known are {known}")
 
