@@ -164,7 +164,7 @@ def test_a_video_and_a_folder_of_a_wide_lens_are_views(tmp_path: Path, walk: tup
 
     writer = cv2.VideoWriter(str(tmp_path / "walk.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (256, 256))
     for image in images[:5]:
-        writer.write(cv2.imread(str(image)))
+        writer.write(np.asarray(cv2.imread(str(image)), np.uint8))
     writer.release()
     video = open_dataset(tmp_path / "walk.avi", camera_file)
     assert (video.camera.width, len(video)) == (dataset.camera.width, 5)

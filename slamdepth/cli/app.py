@@ -16,6 +16,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from slamdepth.cli import (
+    calibrate,
     data_stats,
     depth,
     eval_depth,
@@ -43,6 +44,7 @@ app = typer.Typer(
 )
 app.command("run")(run.run_command)
 app.command("scale")(scale.scale_command)
+app.command("calibrate")(calibrate.calibrate_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)
 app.command("evaluate-mesh")(evaluate_mesh.evaluate_mesh_command)
