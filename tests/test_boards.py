@@ -150,7 +150,10 @@ def test_a_good_calibration_needs_no_advice() -> None:
 
 
 def test_what_to_film_is_said_where_the_images_leave_gaps() -> None:
-    poses = [T for T in board_poses(BOARD, PINHOLE, 40, 1) if T[0, 3] < -60.0]
+    poses = []
+    for T in board_poses(BOARD, PINHOLE, 60, 1):
+        rightmost = (BOARD.corners_mm @ T[:3, :3].T + T[:3, 3])[:, 0].max()
+        poses += [T] if rightmost < 40.0 else []
     fit, views = good_fit(poses)
     views = [replace(view, edge_px=9.0) for view in views]
     said = " ".join(advice(fit, views, size_of(PINHOLE)))

@@ -22,6 +22,8 @@ from slamdepth.typing import Bools, Floats
 _ITERATIONS, _ROUNDS = 60, 3
 _HUBER = 2.0
 _SMALL_GAIN = 1e-9
+_NOTHING_LEFT = 1e-12
+"""Share of a direction of the normal equations that is rounding alone."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ class _Problem:
             reduced += A_v - gain @ B_v.T
             scores.append(a_v - gain @ c_v)
         views, unknowns = len(scores), int(free.sum()) + 6 * len(scores)
-        inverse = np.linalg.pinv(reduced, hermitian=True)
+        inverse = _inverse(reduced, np.sum(A, axis=0))
         weights = self._weights(errors, scale)
         variance = float(np.sum(weights[:, None] * errors**2)) / max(1, 2 * len(errors) - unknowns)
         of_all = variance * inverse
@@ -206,6 +208,14 @@ class _Problem:
         zero = np.zeros_like(x)
         turning = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
         return np.concatenate([by_point, by_point @ turning], axis=2)
+
+
+def _inverse(reduced: Floats, total: Floats) -> Floats:
+    """Inverse of what the poses leave of the normal equations ``total``; large where nothing is left."""
+    size = np.sqrt(np.maximum(np.diag(total), 1e-300))
+    values, vectors = np.linalg.eigh(reduced / np.outer(size, size))
+    inverse = (vectors / np.maximum(values, _NOTHING_LEFT)) @ vectors.T
+    return np.asarray(inverse / np.outer(size, size))
 
 
 def _solve(

@@ -45,8 +45,11 @@ def check_views(found: int, looked_at: int, board: str) -> None:
     )
 
 
-def check_fit(fit: Fit) -> None:
+def check_fit(fit: Fit, better: str = "") -> None:
     """Refuse a calibration that the views do not determine.
+
+    Args:
+        better: another lens model that fits better, as a phrase; it is said instead of what to film.
 
     Raises:
         DatasetError: the focal length is unsure by more than two per cent; says what to film.
@@ -54,10 +57,13 @@ def check_fit(fit: Fit) -> None:
     unsure = float(np.max(fit.sigma[:2] / fit.values[:2]))
     if unsure <= _LARGEST_FOCAL_SIGMA and np.isfinite(fit.sigma).all():
         return
+    percent = f"{100 * min(unsure, 9.99):.1f} %"
+    if better:
+        raise DatasetError(f"the images do not determine the focal length ({percent} unsure): {better}")
     steepest = float(fit.tilts_deg.max())
     why = "the board faces the camera in all views" if steepest < _TILTED_DEG else "the views are too alike"
     raise DatasetError(
-        f"the images do not determine the focal length ({100 * min(unsure, 9.99):.1f} % unsure): {why} (at "
+        f"the images do not determine the focal length ({percent} unsure): {why} (at "
         f"most {steepest:.0f} degrees tilted): tilt it by 30 to 45 degrees, left, right, up and down"
     )
 

@@ -92,22 +92,23 @@ def calibrate(
         notes.append(f"{len(chosen) - len(kept)} views were left out: they fit much worse than the others")
         check_views(len(kept), searched, board.name)
         fit = fit_board(model, board, [view.sighting for view in kept], size)
-    check_fit(fit)
+    rival = fit_board(other, board, [view.sighting for view in kept], size)
+    better = ""
+    if rival.rms_px < _BETTER_SHARE * fit.rms_px:
+        better = (
+            f"a lens of the model '{other.name}' fits better ({rival.rms_px:.2f} pixels instead of "
+            f"{fit.rms_px:.2f}): calibrate {'without' if fisheye else 'with'} --fisheye"
+        )
+        notes.append(better)
+    check_fit(fit, better)
     try:
         camera = model.camera(fit.values, *size)
         notes += check_plausible(camera)
     except CameraError as error:
         raise DatasetError(
-            f"the images determine no possible camera ({error}): film the board in every corner of the "
-            "image, and give --fisheye for a wide lens"
+            f"the images determine no possible camera ({error}): "
+            f"{better or 'film the board in every corner of the image'}"
         ) from error
-    rival = fit_board(other, board, [view.sighting for view in kept], size)
-    if rival.rms_px < _BETTER_SHARE * fit.rms_px:
-        how = "without --fisheye" if fisheye else "with --fisheye"
-        notes.append(
-            f"a lens of the model '{other.name}' fits better: {rival.rms_px:.2f} pixels instead of "
-            f"{fit.rms_px:.2f}; calibrate {how}"
-        )
     notes += advice(fit, kept, size)
     return CalibrationResult(camera, fit, tuple(kept), board, searched, len(views), tuple(notes))
 
