@@ -127,7 +127,7 @@ def test_too_few_views_are_refused() -> None:
     with pytest.raises(DatasetError, match="none of 30 images shows the board charuco:10x7: name yours"):
         check_views(0, 30, BOARD.name)
     with pytest.raises(
-        DatasetError, match="only 4 of 30 images show the board .*: film it for half a minute"
+        DatasetError, match=r"only 4 of 30 images show the board .*: film it for half a minute"
     ):
         check_views(4, 30, BOARD.name)
     check_views(5, 30, BOARD.name)
