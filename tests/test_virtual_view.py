@@ -14,7 +14,7 @@ from wide_world import LENSES, depth_through_lens, render_pair, source_camera, t
 
 import slamdepth
 from slamdepth.calibration import WideLens
-from slamdepth.datasets import open_dataset, write_camera
+from slamdepth.datasets import Dataset, open_dataset, write_camera
 from slamdepth.datasets.image_files import read_image_frame
 from slamdepth.datasets.virtual_view import ViewedSequence, VirtualView, as_pinhole, pinhole_of
 from slamdepth.errors import CameraError
@@ -122,6 +122,10 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_frames_of_a_sequence_are_views(walk: tuple[Path, Path]) -> None:
     wide, pinhole = (open_dataset(path) for path in walk)
     assert isinstance(wide, ViewedSequence)
+    assert isinstance(wide, Dataset)
+    assert wide.has_depth
+    assert wide.name == "wide"
+    assert wide.camera_source == wide.raw.camera_source
     assert wide.camera == pinhole.camera
     assert wide.notes[-1].startswith(
         "images of 256x256 through a lens of the model 'fisheye' are undistorted"
@@ -164,7 +168,7 @@ def test_a_video_and_a_folder_of_a_wide_lens_are_views(tmp_path: Path, walk: tup
 
     writer = cv2.VideoWriter(str(tmp_path / "walk.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (256, 256))
     for image in images[:5]:
-        writer.write(cv2.imread(str(image)))
+        writer.write(np.asarray(cv2.imread(str(image)), np.uint8))
     writer.release()
     video = open_dataset(tmp_path / "walk.avi", camera_file)
     assert (video.camera.width, len(video)) == (dataset.camera.width, 5)

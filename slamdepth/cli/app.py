@@ -16,6 +16,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from slamdepth.cli import (
+    calibrate,
     data_stats,
     depth,
     eval_depth,
@@ -45,6 +46,7 @@ app = typer.Typer(
 app.command("run")(run.run_command)
 app.command("info")(info.info_command)
 app.command("scale")(scale.scale_command)
+app.command("calibrate")(calibrate.calibrate_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)
 app.command("evaluate-mesh")(evaluate_mesh.evaluate_mesh_command)

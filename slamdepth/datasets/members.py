@@ -48,7 +48,7 @@ class Members:
             ) from error
         if len(infos) > _MOST_MEMBERS:
             raise DatasetError(f"{path}: this archive has {len(infos)} files, more than any recording")
-        self.names = frozenset(info.filename for info in infos if not info.is_dir())
+        self.names = frozenset(info.filename for info in infos if info.filename and not info.is_dir())
 
     def read(self, name: str, largest: int = LARGEST_MEMBER) -> bytes:
         """The bytes of a file.

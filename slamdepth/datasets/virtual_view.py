@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -125,8 +125,10 @@ class VirtualView:
             )
 
 
-class ViewedSequence(Dataset):
+class ViewedSequence:
     """A sequence of a camera with a wide lens, whose frames are pinhole views.
+
+    Everything but camera, notes and frames is the sequence's own.
 
     Args:
         raw: the sequence as its camera took it.
@@ -136,34 +138,27 @@ class ViewedSequence(Dataset):
         self.raw = raw
         self.view = _view_of(raw.camera)
         self.camera = self.view.camera
-        self.name, self.path, self.camera_source = raw.name, raw.path, raw.camera_source
-        self.timestamps_s, self.has_depth, self.ground_truth = (
-            raw.timestamps_s,
-            raw.has_depth,
-            raw.ground_truth,
-        )
-        self.truth_source, self.imu_path, self.is_live = raw.truth_source, raw.imu_path, raw.is_live
         self.notes = [*raw.notes, self.view.note]
-        self.frames_promised: int = getattr(raw, "frames_promised", len(raw))
-        self.why_no_depth: str = getattr(raw, "why_no_depth", "")
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "raw":  # not there yet, as while it is copied
+            raise AttributeError(name)
+        return getattr(self.raw, name)
 
     def __len__(self) -> int:
         return len(self.raw)
 
-    def close(self) -> list[str]:
-        """See :meth:`slamdepth.datasets.base.Dataset.close`."""
-        return self.raw.close()
-
     def read(self, index: int, *, with_depth: bool = False) -> Frame:
         """Read one frame; see :meth:`slamdepth.datasets.base.Dataset.read`."""
-        frame = as_pinhole(self.raw.read(index, with_depth=with_depth))
-        self.timestamps_s = self.raw.timestamps_s  # those of a live source grow
-        return frame
+        return as_pinhole(self.raw.read(index, with_depth=with_depth))
+
+    __iter__ = Dataset.__iter__
+    frames = Dataset.frames
 
 
 def through_view(dataset: Dataset) -> Dataset:
     """``dataset``, or its pinhole view where its camera has a wide lens."""
-    return dataset if dataset.camera.lens is None else ViewedSequence(dataset)
+    return dataset if dataset.camera.lens is None else cast("Dataset", ViewedSequence(dataset))
 
 
 def as_pinhole(frame: Frame) -> Frame:
