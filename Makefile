@@ -2,6 +2,7 @@
 # make demo   everything from nothing: environment, weights, a sequence, the main job
 # make test   the tests
 # make docs   the API reference, from the docstrings, in docs/api/
+# make fuzz   damaged input for every reader and parser; CASES of each, 1,000 unless said
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -10,7 +11,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 SOURCES := pyproject.toml constraints.txt README.md LICENSE \
 	$(shell find slamdepth -type f -not -name '*.pyc' -not -name '.*')
 
-.PHONY: demo test lint types layers check docs install install-dev install-docs format clean
+.PHONY: demo test fuzz lint types layers check docs install install-dev install-docs format clean
 
 demo: install
 	$(BIN)/slamdepth weights pull
@@ -21,6 +22,11 @@ test: install-dev
 	$(BIN)/pytest --numprocesses auto --maxprocesses 4
 	SLAMDEPTH_COMPILED=0 $(BIN)/pytest tests/test_features.py tests/test_matching.py tests/test_metric.py \
 		tests/test_moving_things.py tests/test_pose.py tests/test_tracker.py
+
+CASES ?= 1000
+SEED ?= 0
+fuzz: install-dev
+	$(BIN)/python tests/fuzz.py --cases $(CASES) --seed $(SEED)
 
 lint: install-dev
 	$(BIN)/ruff check .

@@ -117,7 +117,11 @@ def run_converter(
     )
     parser.add_argument("source", type=Path, help="folder to convert")
     parser.add_argument("output", type=Path, help="folder to make")
-    parser.add_argument("--link", action="store_true", help="link to the original images instead of copying")
+    parser.add_argument(
+        "--link",
+        action="store_true",
+        help="link to the original images instead of copying; 'slamdepth run' then needs --follow-links",
+    )
     args = parser.parse_args(argv)
     try:
         count = convert(args.source, args.output, args.link)

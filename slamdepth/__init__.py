@@ -13,7 +13,7 @@ from slamdepth._version import __version__
 
 if TYPE_CHECKING:
     from slamdepth.config import Config
-    from slamdepth.datasets import Dataset, open_dataset
+    from slamdepth.datasets import Dataset, ReadOptions, open_dataset
     from slamdepth.dense import DenseEffort, densify
     from slamdepth.depth.base import DepthModel
     from slamdepth.depth.registry import create_depth_model
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         InputError,
         OutputError,
         SlamdepthError,
+        SourceEnded,
         TrackingError,
         WeightsError,
     )
@@ -87,6 +88,7 @@ _HOME = {
     "OutputError": "slamdepth.errors",
     "PointCloud": "slamdepth.mapping.cloud",
     "Prepared": "slamdepth.frontend.preparation",
+    "ReadOptions": "slamdepth.datasets",
     "Reconstruction": "slamdepth.mapping.reconstruction",
     "RelativeError": "slamdepth.evaluation",
     "RunInterrupted": "slamdepth.pipeline",
@@ -96,6 +98,7 @@ _HOME = {
     "RunStatistics": "slamdepth.types",
     "Session": "slamdepth.mapstore",
     "SlamdepthError": "slamdepth.errors",
+    "SourceEnded": "slamdepth.errors",
     "StepResult": "slamdepth.types",
     "StoredDenseDepth": "slamdepth.mapping.dense_depth",
     "StoredFrame": "slamdepth.mapping.keyframe_store",
@@ -149,6 +152,7 @@ __all__ = [
     "OutputError",
     "PointCloud",
     "Prepared",
+    "ReadOptions",
     "Reconstruction",
     "RelativeError",
     "RunInterrupted",
@@ -158,6 +162,7 @@ __all__ = [
     "RunStatistics",
     "Session",
     "SlamdepthError",
+    "SourceEnded",
     "StepResult",
     "StoredDenseDepth",
     "StoredFrame",

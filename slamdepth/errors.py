@@ -8,6 +8,7 @@
     │   ├── ConfigError       an unknown or out-of-range setting
     │   └── OutputError       an output place that cannot be written
     ├── ImageDecodeError      one image that does not decode (the run skips it)
+    ├── SourceEnded           a live source ended or stalled (the run is finished with what it has)
     ├── WeightsError          network weights missing, damaged or of another layout
     └── TrackingError         the tracker was used against its contract
 
@@ -48,6 +49,10 @@ class OutputError(InputError):
 
 class ImageDecodeError(SlamdepthError):
     """One image does not decode; a run skips it and counts it."""
+
+
+class SourceEnded(SlamdepthError):
+    """A live source gives no more frames; a run is finished with those it has."""
 
 
 class WeightsError(SlamdepthError):

@@ -22,19 +22,27 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from slamdepth.calibration.wide_lens import WideLens
+
 _UNIT_TOLERANCE = 0.01
+_MIRRORED = ((-1, 0), (0, 1))
+_UNTIL_SETTLED = (3, 200, 1e-9)
+"""OpenCV's criteria: at most 200 steps, or an error of 1e-9 pixels."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with Brown-Conrady distortion.
+    """A pinhole camera with Brown-Conrady distortion, or one with a lens too wide for that.
 
     Attributes:
         width, height: image size in pixels.
         fx, fy, cx, cy: intrinsics in pixels; the centre of the top left pixel is (0, 0).
-        distortion: ``(k1, k2, p1, p2, k3)`` as OpenCV orders them, or all zero.
+        distortion: ``(k1, k2, p1, p2, k3)`` as OpenCV orders them, or all zero; with ``k4, k5, k6`` of the
+            rational model, eight.
         depth_factor: raw units of a depth image per metre.
         fps: nominal frame rate in Hz.
+        lens: the lens of a camera that is no pinhole, None of others. Sequences give its images as a pinhole
+            sees them (:class:`slamdepth.datasets.virtual_view.VirtualView`); what needs a pinhole refuses it.
     """
 
     width: int
@@ -43,9 +51,10 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_factor: float = 5000.0
     fps: float = 30.0
+    lens: WideLens | None = None
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy, self.depth_factor, self.fps, *self.distortion)
@@ -57,12 +66,16 @@ class Camera:
             raise CameraError(f"camera: fx and fy must be positive, got {self.fx}, {self.fy}")
         if self.depth_factor <= 0 or self.fps <= 0:
             raise CameraError("camera: depth_factor and fps must be positive")
-        if len(self.distortion) != 5:
-            raise CameraError("camera: distortion needs five numbers [k1, k2, p1, p2, k3]")
+        if len(self.distortion) not in (5, 8):
+            raise CameraError(
+                "camera: distortion needs five numbers [k1, k2, p1, p2, k3], or eight with k4, k5, k6"
+            )
+        if self.lens is not None and self.is_distorted:
+            raise CameraError("camera: a wide lens has its own coefficients, and no distortion besides")
 
     @classmethod
     def from_file(cls, path: str | Path, notes: list[str] | None = None) -> Camera:
-        """Read a ``camera.yaml``, or a calibration as OpenCV, ROS, Kalibr, EuRoC or ORB-SLAM write it.
+        """Read a ``camera.yaml``, or a calibration of OpenCV, ROS, Kalibr, EuRoC, Basalt or ORB-SLAM.
 
         Args:
             notes: takes a line for whatever is unusual in the file, or that it was read from another
@@ -78,12 +91,22 @@ class Camera:
 
     @property
     def K(self) -> NDArray[np.float64]:
-        """The ``(3, 3)`` intrinsic matrix in pixels."""
+        """The ``(3, 3)`` intrinsic matrix in pixels.
+
+        Raises:
+            CameraError: the camera is no pinhole, see :attr:`lens`.
+        """
+        self._check_pinhole()
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
     def distortion_array(self) -> NDArray[np.float64]:
-        """Distortion as the ``(5,)`` array OpenCV takes."""
+        """Distortion as the array ``(5,)`` or ``(8,)`` that OpenCV takes.
+
+        Raises:
+            CameraError: the camera is no pinhole, see :attr:`lens`.
+        """
+        self._check_pinhole()
         return np.asarray(self.distortion, dtype=np.float64)
 
     @property
@@ -109,22 +132,45 @@ class Camera:
     def mirrored(self) -> Camera:
         """The camera whose images are those of this one, left and right exchanged: it sees a mirrored world
         as this one sees the world."""
-        k1, k2, p1, p2, k3 = self.distortion
-        return replace(self, cx=self.width - 1 - self.cx, distortion=(k1, k2, p1, -p2, k3))
+        k1, k2, p1, p2, *others = self.distortion
+        lens = None if self.lens is None else self.lens.turned(_MIRRORED)
+        return replace(self, cx=self.width - 1 - self.cx, distortion=(k1, k2, p1, -p2, *others), lens=lens)
 
     def without_distortion(self) -> Camera:
-        """The pinhole camera that undistorted pixels belong to."""
+        """The pinhole camera that undistorted pixels belong to.
+
+        Raises:
+            CameraError: the camera is no pinhole, see :attr:`lens`.
+        """
+        self._check_pinhole()
         return replace(self, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
 
     def undistort_points(self, points_px: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Map raw pixels ``(N, 2)`` to pixels ``(N, 2)`` of :meth:`without_distortion`."""
+        """Map raw pixels ``(N, 2)`` to pixels ``(N, 2)`` of :meth:`without_distortion`.
+
+        Raises:
+            CameraError: the camera is no pinhole, see :attr:`lens`.
+        """
+        self._check_pinhole()
         points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 2)
         if not self.is_distorted or len(points) == 0:
             return np.array(points)
         import cv2
 
-        undistorted = cv2.undistortPoints(points[:, None], self.K, self.distortion_array, P=self.K)
+        if len(self.distortion) == 5:
+            undistorted = cv2.undistortPoints(points[:, None], self.K, self.distortion_array, P=self.K)
+        else:  # the rational model is for strong distortion, where OpenCV's five steps are too few
+            undistorted = cv2.undistortPoints(
+                points[:, None], self.K, self.distortion_array, P=self.K, criteria=_UNTIL_SETTLED
+            )
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
+
+    def _check_pinhole(self) -> None:
+        if self.lens is not None:
+            raise CameraError(
+                f"camera: a lens of the model {self.lens.model!r} is no pinhole: undistort its images to a "
+                "pinhole view first, as open_dataset and VirtualView do"
+            )
 
 
 @dataclass(frozen=True)

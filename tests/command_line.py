@@ -71,14 +71,14 @@ def command(*arguments: object) -> list[str]:
 
 
 def copy_of(sequence: Path, folder: Path) -> Path:
-    """A copy of a TUM folder whose images are links."""
+    """A copy of a TUM folder whose images are the same files."""
     for path in sequence.rglob("*"):
         target = folder / path.relative_to(sequence)
         if path.is_dir():
             target.mkdir(parents=True, exist_ok=True)
         elif path.suffix == ".png":
             target.parent.mkdir(parents=True, exist_ok=True)
-            target.symlink_to(path)
+            os.link(path, target)
         else:
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(path, target)

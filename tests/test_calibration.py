@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from wide_world import LENSES, wide_camera
 
+from slamdepth.calibration import WideLens
 from slamdepth.calibration.plausible import check_plausible
 from slamdepth.errors import CameraError
 from slamdepth.io import write_camera
@@ -43,7 +46,7 @@ anything = st.floats(-1e5, 1e5)
         fy=positive,
         cx=anything,
         cy=anything,
-        distortion=st.tuples(*[anything] * 5),
+        distortion=st.one_of(st.tuples(*[anything] * 5), st.tuples(*[anything] * 8)),
         depth_factor=positive,
         fps=positive,
     )
@@ -91,6 +94,21 @@ def test_round_trip_of_plausible_cameras(tmp_path: Path, camera: Camera) -> None
     assert notes == []
 
 
+@pytest.mark.parametrize("lens", LENSES.values(), ids=lambda lens: lens.model)
+def test_round_trip_of_wide_lenses(tmp_path: Path, lens: WideLens) -> None:
+    camera = replace(wide_camera(640, lens), depth_factor=1000.0)
+    write_camera(tmp_path / "camera.yaml", camera)
+    notes: list[str] = []
+    assert Camera.from_file(tmp_path / "camera.yaml", notes) == camera
+    assert notes == []
+
+
+def test_round_trip_of_eight_coefficients(tmp_path: Path) -> None:
+    camera = Camera(640, 480, 500.0, 501.0, 320.0, 240.0, (0.4, -0.3, 1e-3, -1e-3, 0.1, 0.5, -0.2, 0.05))
+    write_camera(tmp_path / "camera.yaml", camera)
+    assert Camera.from_file(tmp_path / "camera.yaml") == camera
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -128,7 +146,10 @@ def test_numbers_are_read_in_any_notation(
     [
         (GOOD + "---\n" + GOOD.replace("500", "600"), "holds 2 documents that differ; leave one camera"),
         (GOOD + "---\nnothing\n", "holds 2 documents that differ"),
-        (GOOD + "focal: 3\n", "unknown key 'focal'; allowed are width, height, fx, fy, cx, cy, distortion,"),
+        (
+            GOOD + "focal: 3\n",
+            "unknown key 'focal'; allowed are width, height, fx, fy, cx, cy, model, dist",
+        ),
         (GOOD + "3: 3\n", "unknown key 3; allowed are width"),
         (GOOD.replace("fy: 501.5\n", ""), "key fy missing; needed are width, height, fx, fy, cx, cy"),
         ("width: 640\nheight: 480\n", "keys fx, fy, cx, cy missing"),
@@ -143,6 +164,11 @@ def test_numbers_are_read_in_any_notation(
         (GOOD.replace("640", "0"), "width and height must be positive"),
         (GOOD + "distortion: [1, 2, 3, 4]\n", "key 'distortion' must be five numbers [k1, k2, p1, p2, k3]"),
         (GOOD + "distortion: [1, 2, 3, 4, x]\n", "key 'distortion' must be a number"),
+        (GOOD + "model: wide\n", "key 'model' must be one of brown_conrady, fisheye, double_sphere, exten"),
+        (GOOD + "model: fisheye\n", "the model 'fisheye' must be 4 numbers [k1, k2, k3, k4], found None"),
+        (GOOD + "model: fov\ndistortion: [x]\n", "key 'distortion' must be a number"),
+        (GOOD + "model: fisheye\ndistortion: [-2, 0, 0, 0]\n", "less than half way to an edge"),
+        (GOOD + "model: fisheye\ndistortion: [-99, 0, 0, 0]\n", "sees nothing: check the order"),
         (GOOD + "depth_factor: 0\n", "depth_factor and fps must be positive"),
         (GOOD + "fx: 501\n", "key 'fx' is given twice"),
         (GOOD.replace("320", "3000"), "cx 3000 lies outside the image, whose width is 640"),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from slamdepth.calibration import WideLens
 from slamdepth.datasets import open_dataset
 from slamdepth.errors import CameraError
 from slamdepth.types import Camera
@@ -195,6 +197,7 @@ def ros(what: str, by: str) -> str:
 
 
 EIGHT = "rows: 1\n  cols: 8\n  data: [-0.265, -0.0467, 0.0018, -3e-04, 0.252, {}, 0, 0]"
+TWELVE = "rows: 1\n  cols: 12\n  data: [0, 0, 0, 0, 0, 0, 0, 0, 1e-3, 0, 0, 0]"
 FIVE = ROS[ROS.index("rows: 1\n") : ROS.index("\nrectification")]
 
 
@@ -203,14 +206,31 @@ def test_coefficients_that_are_zero_may_follow(tmp_path: Path) -> None:
     assert read(tmp_path, text) == CAMERA
 
 
+@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial"])
+def test_eight_coefficients_of_the_rational_model_are_read(tmp_path: Path, model: str) -> None:
+    camera = read(tmp_path, ros(FIVE, EIGHT.format(0.1)).replace("plumb_bob", model))
+    assert camera.distortion == (*CAMERA.distortion, 0.1, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("model", ["equidistant", "fisheye", "kannala_brandt4"])
+def test_a_fisheye_of_ros_or_opencv_is_read(tmp_path: Path, model: str) -> None:
+    four = "rows: 1\n  cols: 4\n  data: [-0.05, 0.01, 0.002, -0.001]"
+    lens = WideLens("fisheye", (-0.05, 0.01, 0.002, -0.001))
+    expected = replace(CAMERA, distortion=(0.0,) * 5, lens=lens)
+    assert read(tmp_path, ros(FIVE, four).replace("plumb_bob", model)) == expected
+    text = ros(FIVE, four).replace("distortion_model: plumb_bob", "fisheye_model: 1")
+    assert read(tmp_path, text) == expected
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (ros("plumb_bob", "equidistant"), "a lens of the model 'equidistant' is not supported"),
-        (OPENCV + "fisheye_model: 1\n", "a lens of the model 'fisheye' is not supported"),
-        (ros(FIVE, EIGHT.format(0.1)), "key 'distortion_coefficients' has 8 coefficients; supported are"),
+        (ros("plumb_bob", "mirror_ball"), "a lens of the model 'mirror_ball' is not supported"),
+        (ros("plumb_bob", "equidistant"), "the model 'fisheye' must be 4 numbers [k1, k2, k3, k4], found 5"),
+        (OPENCV + "fisheye_model: 1\n", "the model 'fisheye' must be 4 numbers [k1, k2, k3, k4], found 5"),
+        (ros(FIVE, TWELVE), "key 'distortion_coefficients' has 12 coefficients; supported are"),
         (ECHO.replace('"plumb_bob"', "''"), "a lens of the model '' is not supported"),
-        (ECHO.replace('"plumb_bob"', "equidistant").replace("D: [-0.265", "D: [0"), "'equidistant' is not"),
+        (ECHO.replace('"plumb_bob"', "equidistant").replace("D: [-0.265", "D: [0"), "must be 4 numbers"),
         (ECHO[: ECHO.index("K: ")] + "K: [0, 0, 0, 0, 0, 0, 0, 0, 0]\n", "all zero: this camera was never"),
         (ECHO + ECHO.replace("535.5", "600.0"), "holds 2 documents that differ"),
         (ros("image_height: 480\n", ""), "a calibration without image_height: add the size"),

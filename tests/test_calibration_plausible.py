@@ -8,6 +8,7 @@ import math
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -146,6 +147,37 @@ def test_no_pixel_of_what_passes_is_seen_twice(k1: float, k2: float, k3: float) 
     inside = reached[: np.argmax(reached > math.hypot(320, 240) / 525)]
     assert len(inside)
     assert (np.diff(inside) > 0).all()
+
+
+@settings(deadline=None, max_examples=200)
+@given(*[st.floats(-1.0, 1.0)] * 6)
+def test_no_pixel_of_a_rational_lens_that_passes_is_seen_twice(
+    k1: float, k2: float, k3: float, k4: float, k5: float, k6: float
+) -> None:
+    camera = with_distortion(k1, k2, 0.0, 0.0, k3, k4, k5, k6)
+    try:
+        notes = check_plausible(camera)
+    except CameraError:
+        return
+    if notes:
+        assert "turns back 9" in notes[0]
+        return
+    r = np.linspace(0.0, 10.0, 20_001)
+    below = 1 + k4 * r**2 + k5 * r**4 + k6 * r**6
+    reached = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) / below
+    inside = reached[: np.argmax(reached > math.hypot(320, 240) / 525)]
+    assert len(inside)
+    assert (np.diff(inside) > 0).all()
+
+
+def test_pixels_of_a_strong_rational_lens_come_back_exactly() -> None:
+    camera = with_distortion(8.2, 3.1, 1e-4, -2e-4, 0.12, 8.6, 5.9, 0.9)
+    assert check_plausible(camera) == []
+    raw_px = np.random.default_rng(0).uniform(0, [639, 479], (200, 2))
+    plane = (camera.undistort_points(raw_px) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    rays = np.column_stack([plane, np.ones(len(plane))])
+    back_px, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.K, camera.distortion_array)
+    np.testing.assert_allclose(back_px[:, 0], raw_px, atol=1e-6)
 
 
 @settings(deadline=None, max_examples=200)

@@ -12,9 +12,10 @@ import pytest
 from PIL import Image
 from sequences import CAMERA, depth_raw, image_rgb, make_tum, write_image
 
+from slamdepth.calibration import WideLens
 from slamdepth.datasets import open_dataset, write_camera
 from slamdepth.datasets.image_files import read_image_frame
-from slamdepth.datasets.orientation import exif_orientation, turned_camera, turned_image
+from slamdepth.datasets.orientation import _AXES, exif_orientation, turned_camera, turned_image
 from slamdepth.errors import CameraError
 from slamdepth.pipeline.depth_maps.sources import open_source
 from slamdepth.types import Camera
@@ -32,6 +33,18 @@ def write_stored(path: Path, upright_rgb: np.ndarray, orientation: int) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(turned_image(upright_rgb, TO_STORED[orientation])).save(path, exif=exif)
     return path
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_wide_lens_turns_with_its_images(orientation: int) -> None:
+    lens = WideLens("unified", (1.2, -0.1, 0.02, 0.003, -0.004))
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))
+    stored = lens.project(np.column_stack([points, np.ones(50)]))
+    turned = turned_camera(Camera(16, 12, 20.0, 20.0, 7.1, 5.9, lens=lens), orientation)
+    axes = np.array(_AXES[orientation], float)
+    assert turned.lens is not None
+    found = turned.lens.project(np.column_stack([points @ axes.T, np.ones(50)]))
+    np.testing.assert_allclose(found, stored @ axes.T, atol=1e-12)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

@@ -74,7 +74,7 @@ def test_a_folder_of_images_is_run_like_its_sequence(
     folder = tmp_path / "images"
     folder.mkdir()
     for number, path in enumerate(images(tiny_room)):
-        (folder / f"frame-{number + 1}.png").symlink_to(path)
+        (folder / f"frame-{number + 1}.png").hardlink_to(path)
     refused = call("run", folder, "--depth", "constant", "--no-mesh", "-o", tmp_path / "refused")
     assert refused.returncode == 2
     assert refused.stderr.count("error: ") == 1

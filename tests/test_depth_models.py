@@ -20,6 +20,7 @@ from slamdepth.depth.evaluate import judge_depth
 from slamdepth.depth.head import HeadEnsemble, HeadShape
 from slamdepth.depth.model import Dinov2Depth
 from slamdepth.depth.registry import create_depth_model, depth_model_names
+from slamdepth.depth.wide_view import middle_view
 from slamdepth.errors import CameraError, ConfigError, DatasetError, WeightsError
 from slamdepth.report.depth import model_lines
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame, WeightsInfo
@@ -86,6 +87,15 @@ def test_prediction_is_deterministic_and_scales_with_the_focal_length() -> None:
     np.testing.assert_array_equal(first.values, again.values)
     longer = model.predict(frame_of(focal=120.0))
     np.testing.assert_allclose(longer.values, 2 * first.values, rtol=1e-5)
+
+
+def test_a_wide_view_has_the_scale_of_its_middle() -> None:
+    model, wide = tiny_model(), frame_of(128, 96, focal=50.0)
+    found = middle_view(wide)
+    assert found is not None
+    middle, at = found
+    both = model.predict(wide).values[at] / model.predict(middle).values
+    assert np.median(both) == pytest.approx(1.0, rel=1e-5)
 
 
 def test_the_default_model_names_its_training_data() -> None:

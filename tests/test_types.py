@@ -12,13 +12,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slamdepth.datasets.orientation import turned_camera
+from slamdepth.dense.rectify import Rectifier
 from slamdepth.errors import CameraError
+from slamdepth.training.lens import raw_pixels, turning_point
 from slamdepth.types import Camera, Frame, Trajectory
 
 FR1 = Camera(
     640, 480, 517.306408, 516.469215, 318.643040, 255.313989,
     (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
 )  # fmt: skip
+
+
+TURNED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 @given(st.integers(32, 2000), st.integers(32, 2000))
@@ -64,6 +70,42 @@ def test_undistort_points_undoes_the_brown_conrady_model() -> None:
     yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     raw = np.stack([FR1.fx * xd + FR1.cx, FR1.fy * yd + FR1.cy], axis=1)
     np.testing.assert_allclose(FR1.undistort_points(raw), grid, atol=0.05)
+
+
+RATIONAL = Camera(
+    640, 480, 420.0, 421.0, 318.0, 243.0, (0.6, -2.6, 3e-4, -2e-4, 1.5, 0.48, -2.4, 1.4), fps=15.0
+)  # fmt: skip
+"""As of a depth camera of 80 degrees: k4, k5, k6 besides."""
+
+
+def test_eight_coefficients_are_used_wherever_five_are() -> None:
+    grid = np.stack(np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 479, 7)), -1).reshape(-1, 2)
+    pinhole = RATIONAL.without_distortion()
+    assert pinhole.distortion == (0.0,) * 5
+    assert (RATIONAL.is_distorted, pinhole.is_distorted) == (True, False)
+    rays = np.column_stack(
+        [(RATIONAL.undistort_points(grid) - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy], np.ones(63)]
+    )
+    np.testing.assert_allclose(raw_pixels(rays, RATIONAL), grid, atol=1e-6)
+    mirrored = RATIONAL.mirrored()
+    expected = [639.0, 0.0] + grid * [-1.0, 1.0]
+    np.testing.assert_allclose(raw_pixels(rays * [-1.0, 1.0, 1.0], mirrored), expected, atol=1e-6)
+    upright = turned_camera(RATIONAL, 6)
+    turned = np.column_stack([479.0 - grid[:, 1], grid[:, 0]])
+    np.testing.assert_allclose(raw_pixels(rays @ TURNED.T, upright), turned, atol=1e-6)
+    rectifier = Rectifier.of(RATIONAL, 640, 0.0)
+    positions = rectifier.positions(None, 0.5)
+    assert positions is not None
+    there = np.column_stack([(100 - pinhole.cx) / pinhole.fx, (50 - pinhole.cy) / pinhole.fy, 1.0])
+    np.testing.assert_allclose(positions[50, 100], raw_pixels(there, RATIONAL)[0], atol=1e-3)
+
+
+def test_rays_beyond_a_rational_lens_do_not_fold_back() -> None:
+    camera = Camera(640, 480, 420.0, 421.0, 318.0, 243.0, (-0.3, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0))
+    limit = turning_point(camera)
+    r = np.linspace(0.0, 4.0, 40_001)
+    reached = r * (1 - 0.3 * r**2) / (1 + 0.1 * r**2)
+    assert limit == pytest.approx(r[np.argmax(np.diff(reached) < 0)], abs=2e-3)
 
 
 def test_undistort_points_of_a_pinhole_copies() -> None:

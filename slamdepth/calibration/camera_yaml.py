@@ -9,13 +9,17 @@
     fy: 539.2
     cx: 320.1
     cy: 247.6
-    distortion: [0.0, 0.0, 0.0, 0.0, 0.0]   # k1 k2 p1 p2 k3; may be absent
+    distortion: [0.0, 0.0, 0.0, 0.0, 0.0]   # k1 k2 p1 p2 k3, or with k4 k5 k6; may be absent
     depth_factor: 5000.0                    # raw units per metre; may be absent
     fps: 30.0                               # may be absent
 
+A wide lens has ``model: fisheye`` (or another of :data:`slamdepth.calibration.wide_lens.WIDE_MODELS`) and its
+coefficients as ``distortion``.
+
 Numbers may be quoted or have an exponent without a dot, and a ``---`` or ``...`` may end the file. Files of
-OpenCV's, ROS's (:mod:`slamdepth.calibration.dialects`), Kalibr's, EuRoC's and ORB-SLAM's
-(:mod:`slamdepth.calibration.slam_dialects`) are read too.
+OpenCV's, ROS's (:mod:`slamdepth.calibration.dialects`), Kalibr's, EuRoC's, ORB-SLAM's
+(:mod:`slamdepth.calibration.slam_dialects`), Basalt's and camodocal's
+(:mod:`slamdepth.calibration.wide_dialects`) are read too.
 """
 
 from __future__ import annotations
@@ -36,6 +40,7 @@ from slamdepth.calibration.dialects import (
 )
 from slamdepth.calibration.plausible import Pinhole, check_plausible
 from slamdepth.calibration.slam_dialects import as_opencv
+from slamdepth.calibration.wide_lens import WIDE_MODELS, WideLens
 from slamdepth.errors import CameraError
 
 _log = logging.getLogger(__name__)
@@ -44,11 +49,12 @@ _Camera = TypeVar("_Camera", bound=Pinhole)
 
 CAMERA_FILE = "camera.yaml"
 REQUIRED_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
-OPTIONAL_KEYS = ("distortion", "depth_factor", "fps")
+OPTIONAL_KEYS = ("model", "distortion", "depth_factor", "fps")
+_PINHOLE_MODEL = "brown_conrady"
 
 
 def read_camera(path: str | Path, make: Callable[..., _Camera], notes: list[str] | None = None) -> _Camera:
-    """Read a ``camera.yaml``, or a calibration as OpenCV, ROS, Kalibr, EuRoC or ORB-SLAM write it.
+    """Read a ``camera.yaml``, or a calibration of another tool.
 
     Args:
         make: the class of the camera, which takes the keys of the file by name.
@@ -60,7 +66,31 @@ def read_camera(path: str | Path, make: Callable[..., _Camera], notes: list[str]
             type, or no camera has such intrinsics; names the file, the key and the allowed ones.
     """
     path = Path(path)
-    values = as_opencv(path, _load(path))
+    return make_camera(path, _load(path), make, notes)
+
+
+def read_values(path: Path) -> dict[Any, Any]:
+    """The keys of a calibration file, for those that hold several cameras; see :func:`make_camera`.
+
+    Raises:
+        CameraError: the file cannot be read, or is no YAML with keys.
+    """
+    return _load(path)
+
+
+def make_camera(
+    path: Path, values: dict[Any, Any], make: Callable[..., _Camera], notes: list[str] | None = None
+) -> _Camera:
+    """The camera of what :func:`read_camera` reads of a file, or of a recording that holds the same.
+
+    Args:
+        path: names it in messages.
+        values: the keys of a ``camera.yaml``, or of another tool's calibration.
+
+    Raises:
+        CameraError: as :func:`read_camera`.
+    """
+    values = as_opencv(path, values)
     foreign = is_calibration(values)
     camera = _made(path, translated(path, values) if foreign else values, make)
     try:
@@ -79,8 +109,11 @@ def read_camera(path: str | Path, make: Callable[..., _Camera], notes: list[str]
 
 def _described(camera: Pinhole) -> str:
     values = " ".join(f"{key} {getattr(camera, key):g}" for key in ("fx", "fy", "cx", "cy"))
-    distortion = ", ".join(f"{value:g}" for value in camera.distortion)
-    return f"{camera.width}x{camera.height}, {values}, distortion [{distortion}], {camera.fps:g} Hz"
+    numbers, what = camera.distortion, "distortion"
+    if camera.lens is not None:
+        numbers, what = camera.lens.coefficients, camera.lens.model
+    distortion = ", ".join(f"{value:g}" for value in numbers)
+    return f"{camera.width}x{camera.height}, {values}, {what} [{distortion}], {camera.fps:g} Hz"
 
 
 def _made(path: Path, values: dict[Any, Any], make: Callable[..., _Camera]) -> _Camera:
@@ -95,14 +128,21 @@ def _made(path: Path, values: dict[Any, Any], make: Callable[..., _Camera]) -> _
             f"needed are {', '.join(REQUIRED_KEYS)}, allowed also {', '.join(OPTIONAL_KEYS)}"
         )
     settings: dict[str, Any] = {}
+    model = str(values.get("model", _PINHOLE_MODEL))
+    if model not in (_PINHOLE_MODEL, *WIDE_MODELS):
+        known = ", ".join((_PINHOLE_MODEL, *WIDE_MODELS))
+        raise CameraError(f"{path}: key 'model' must be one of {known}, found {model[:40]!r}")
     for key, value in values.items():
         if key in ("width", "height"):
             settings[key] = _whole(path, key, value)
-        elif key == "distortion":
-            settings[key] = _distortion(path, value)
-        else:
+        elif key not in ("model", "distortion"):
             settings[key] = _number(path, key, value)
+    if model == _PINHOLE_MODEL:
+        settings["distortion"] = _distortion(path, values.get("distortion"))
+    coefficients = () if model == _PINHOLE_MODEL else _coefficients(path, model, values.get("distortion"))
     try:
+        if coefficients:
+            settings["lens"] = WideLens(model, coefficients)
         return make(**settings)
     except CameraError as error:
         raise CameraError(f"{path}: {str(error).removeprefix('camera: ')}") from error
@@ -121,7 +161,10 @@ def camera_yaml(camera: Pinhole) -> str:
     """The text of a ``camera.yaml`` that reads back as an equal camera, should it be a plausible one."""
     values: dict[str, Any] = {key: int(getattr(camera, key)) for key in ("width", "height")}
     values |= {key: float(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy")}
-    values["distortion"] = [float(value) for value in camera.distortion]
+    numbers = camera.distortion
+    if camera.lens is not None:
+        values["model"], numbers = camera.lens.model, camera.lens.coefficients
+    values["distortion"] = [float(value) for value in numbers]
     values |= {key: float(getattr(camera, key)) for key in ("depth_factor", "fps")}
     return yaml.safe_dump(values, sort_keys=False, default_flow_style=None)
 
@@ -191,8 +234,19 @@ def _whole(path: Path, key: str, value: Any) -> int:
 def _distortion(path: Path, value: Any) -> tuple[float, ...]:
     if value is None or value == []:
         return (0.0,) * 5
-    if not isinstance(value, list) or len(value) != 5:
+    if not isinstance(value, list) or len(value) not in (5, 8):
         raise CameraError(
-            f"{path}: key 'distortion' must be five numbers [k1, k2, p1, p2, k3], found {value!r}"
+            f"{path}: key 'distortion' must be five numbers [k1, k2, p1, p2, k3], or eight with k4, k5, k6, "
+            f"found {value!r}"
+        )
+    return tuple(_number(path, "distortion", item) for item in value)
+
+
+def _coefficients(path: Path, model: str, value: Any) -> tuple[float, ...]:
+    names = WIDE_MODELS[model]
+    if not isinstance(value, list) or len(value) != len(names):
+        raise CameraError(
+            f"{path}: key 'distortion' of the model {model!r} must be {len(names)} numbers "
+            f"[{', '.join(names)}], found {value!r}"
         )
     return tuple(_number(path, "distortion", item) for item in value)

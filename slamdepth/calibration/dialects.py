@@ -15,6 +15,7 @@ from typing import Any
 
 import yaml
 
+from slamdepth.calibration.wide_lens import WIDE_MODELS
 from slamdepth.errors import CameraError
 
 _NAMES = {
@@ -32,6 +33,22 @@ _NAMES = {
 _BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "radial_tangential", "brown_conrady")
 _UNNAMED = ("", "none", "pinhole", "inverse_brown_conrady", "modified_brown_conrady")
 """Models that drivers name for images without distortion; taken where all coefficients are zero."""
+_WIDE = {
+    "equidistant": "fisheye",
+    "equi": "fisheye",
+    "kannala_brandt": "fisheye",
+    "kannala_brandt4": "fisheye",
+    "kannala_brandt8": "fisheye",
+    "kannalabrandt8": "fisheye",
+    "kb4": "fisheye",
+    "ds": "double_sphere",
+    "eucm": "extended_unified",
+    "mei": "unified",
+    "omni": "unified",
+    "omnidirectional": "unified",
+    **{name: name for name in WIDE_MODELS},
+}
+"""Models of wide lenses by the names that tools give them."""
 _SKEW_SHARE = 1e-6
 
 
@@ -60,8 +77,8 @@ def translated(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
     """The values of a calibration under the keys of ``camera.yaml``.
 
     Raises:
-        CameraError: what is needed is missing, malformed or said twice, or the lens is of a model that
-            :class:`~slamdepth.types.Camera` is not; names file and key.
+        CameraError: what is needed is missing, malformed or said twice, or the lens is of an unknown model;
+            names file and key.
     """
     keys = _find_keys(path, values)
     fx, skew, cx, _, fy, cy, *last = _matrix(path, keys["matrix"], values[keys["matrix"]])
@@ -71,9 +88,8 @@ def translated(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
         raise CameraError(f"{path}: key {keys['matrix']!r} is all zero: this camera was never calibrated")
     if last != [0.0, 0.0, 1.0]:
         raise CameraError(f"{path}: key {keys['matrix']!r} must be [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
-    _check_model(path, keys, values)
     found: dict[str, Any] = {key: values[keys[key]] for key in ("width", "height")}
-    found |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": _distortion(path, keys, values)}
+    found |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **_lens(path, keys, values)}
     return found | {key: values[keys[key]] for key in ("fps", "depth_factor") if key in keys}
 
 
@@ -98,34 +114,50 @@ def _normalised(key: Any) -> str:
     return str(key).lower().replace("_", "")
 
 
-def _check_model(path: Path, keys: dict[str, Any], values: dict[Any, Any]) -> None:
+def _lens(path: Path, keys: dict[str, Any], values: dict[Any, Any]) -> dict[str, Any]:
+    """``distortion``, and ``model`` of a wide lens."""
     model = values[keys["model"]] if "model" in keys else "plumb_bob"
     if "fisheye" in keys and values[keys["fisheye"]]:
         model = "fisheye"
     name = str(model or "").lower().replace("-", "_")
-    if name in _UNNAMED and not any(_distortion(path, keys, values)):
-        return
+    numbers = _coefficients(path, keys, values)
+    if name in _WIDE:
+        return {"model": _WIDE[name], "distortion": _of_wide(path, keys, numbers, _WIDE[name])}
+    if name in _UNNAMED and not any(numbers):
+        return {"distortion": [0.0] * 5}
     if name not in _BROWN_CONRADY:
         raise CameraError(
-            f"{path}: a lens of the model {str(model)[:40]!r} is not supported, only a pinhole with "
-            "[k1, k2, p1, p2, k3] (plumb_bob): calibrate with that model, or undistort the images first"
+            f"{path}: a lens of the model {str(model)[:40]!r} is not supported, only a pinhole with [k1, k2, "
+            f"p1, p2, k3, k4, k5, k6] (plumb_bob, rational_polynomial), and {', '.join(WIDE_MODELS)}: "
+            "calibrate with one of them, or undistort the images first"
         )
+    if any(numbers[8:]):
+        raise CameraError(
+            f"{path}: key {keys['distortion']!r} has {len(numbers)} coefficients; supported are [k1, k2, p1, "
+            "p2, k3, k4, k5, k6]: calibrate without the thin prism or tilted model"
+        )
+    return {"distortion": (numbers + [0.0] * 8)[: 8 if any(numbers[5:]) else 5]}
 
 
-def _distortion(path: Path, keys: dict[str, Any], values: dict[Any, Any]) -> list[float]:
+def _of_wide(path: Path, keys: dict[str, Any], numbers: list[float], model: str) -> list[float]:
+    names = WIDE_MODELS[model]
+    few = {1, len(names)} if model == "unified" else {len(names)}  # xi alone: without distortion
+    if len(numbers) not in few and (len(numbers) < len(names) or any(numbers[len(names) :])):
+        raise CameraError(
+            f"{path}: key {keys.get('distortion', 'distortion_coefficients')!r} of a lens of the model "
+            f"{model!r} must be {len(names)} numbers [{', '.join(names)}], found {len(numbers)}"
+        )
+    return (numbers + [0.0] * len(names))[: len(names)]
+
+
+def _coefficients(path: Path, keys: dict[str, Any], values: dict[Any, Any]) -> list[float]:
     if "distortion" not in keys:
         like = [key for key in values if "dist" in _normalised(key) and key != keys.get("model")]
         if like:
             raise CameraError(f"{path}: key {like[0]!r} is not known; write 'distortion_coefficients'")
-        return [0.0] * 5
+        return []
     key = keys["distortion"]
-    numbers = _numbers(path, key, [] if values[key] is None else values[key])
-    if any(numbers[5:]):
-        raise CameraError(
-            f"{path}: key {key!r} has {len(numbers)} coefficients; supported are [k1, k2, p1, p2, k3]: "
-            "calibrate without the rational, thin prism or tilted model"
-        )
-    return (numbers + [0.0] * 5)[:5]
+    return _numbers(path, key, [] if values[key] is None else values[key])
 
 
 def _matrix(path: Path, key: Any, value: Any) -> list[float]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from slamdepth.calibration.wide_lens import WIDE_MODELS, WideLens
 from slamdepth.errors import CameraError
 
 if TYPE_CHECKING:
@@ -46,6 +47,9 @@ _LEAST_REACH = 0.9
 """Least share of the way to the farthest corner before distortion folds back: fits of real lenses may fold
 where the calibration board never was."""
 
+_LEAST_HALF_VIEW = 0.5
+"""Least share of the way to the edges of an image that a wide lens shows once."""
+
 _STRONGEST, _NEGLIGIBLE = 1e4, 1e-12
 """Coefficients of a larger magnitude are refused, smaller ones count as zero."""
 
@@ -66,11 +70,13 @@ class Pinhole(Protocol):
     @property
     def cy(self) -> float: ...
     @property
-    def distortion(self) -> tuple[float, float, float, float, float]: ...
+    def distortion(self) -> tuple[float, ...]: ...
     @property
     def depth_factor(self) -> float: ...
     @property
     def fps(self) -> float: ...
+    @property
+    def lens(self) -> WideLens | None: ...
     @property
     def is_distorted(self) -> bool: ...
     def undistort_points(self, points_px: NDArray[np.floating]) -> NDArray[np.float64]: ...
@@ -89,13 +95,15 @@ def check_plausible(camera: Pinhole) -> list[str]:
     """
     _check_focal_lengths(camera)
     notes = [*_check_principal_point(camera), *_check_distortion(camera)]
+    if camera.lens is not None:
+        _check_lens(camera, camera.lens)
     if max(camera.fx / camera.fy, camera.fy / camera.fx) > _USUAL_ASPECT:
         notes.append(
             f"fx {camera.fx:g} and fy {camera.fy:g} are of pixels that are not square: unless the images "
             "were stretched, one of them and the result are wrong"
         )
     view_deg = horizontal_view_deg(camera)
-    if view_deg > WIDE_VIEW_DEG:
+    if view_deg > WIDE_VIEW_DEG and camera.lens is None:
         notes.append(
             f"fx {camera.fx:g} is a horizontal view of {view_deg:.0f} degrees in an image {camera.width} "
             "pixels wide: if the camera sees less, fx, fy, cx and cy are of images of another size"
@@ -124,7 +132,9 @@ def _view_deg(size: int, focal: float) -> float:
 def fold_radius(camera: Pinhole) -> float:
     """Distance from the optical axis where radial distortion turns back, as tan of the angle in the distorted
     image; infinity where it never does."""
-    k1, k2, _, _, k3 = camera.distortion
+    k1, k2, _, _, k3, *rational = camera.distortion
+    if any(rational):
+        return _rational_fold_radius((k1, k2, k3), tuple(rational))
     slope = np.array([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])  # of r (1 + k1 r² + k2 r⁴ + k3 r⁶), in r²
     turns = np.roots(np.where(np.abs(slope) < _NEGLIGIBLE, 0.0, slope))
     real = turns.real[np.abs(turns.imag) <= 1e-9 * np.abs(turns)]
@@ -133,6 +143,39 @@ def fold_radius(camera: Pinhole) -> float:
         return math.inf
     r2 = float(squares.min())
     return math.sqrt(r2) * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+
+
+def _rational_fold_radius(above: tuple[float, ...], below: tuple[float, ...]) -> float:
+    """The same of r (1 + k1 s + k2 s² + k3 s³) / (1 + k4 s + k5 s² + k6 s³) with s = r²."""
+    top, bottom = np.array([*above[::-1], 1.0]), np.array([*below[::-1], 1.0])
+    turning = 2.0 * np.polysub(np.polymul(np.polyder(top), bottom), np.polymul(top, np.polyder(bottom)))
+    growth = np.polyadd(np.polymul(top, bottom), np.append(turning, 0.0))
+    ends = np.concatenate([np.roots(np.where(np.abs(p) < _NEGLIGIBLE, 0.0, p)) for p in (growth, bottom)])
+    real = ends.real[np.abs(ends.imag) <= 1e-9 * np.abs(ends)]
+    squares = real[real > 0]
+    if not len(squares):
+        return math.inf
+    square = float(squares.min())
+    divisor = float(np.polyval(bottom, square))
+    return (
+        math.inf
+        if abs(divisor) < _NEGLIGIBLE
+        else math.sqrt(square) * float(np.polyval(top, square)) / divisor
+    )
+
+
+def _check_lens(camera: Pinhole, lens: WideLens) -> None:
+    """Refuse a wide lens that does not see the middle of the image."""
+    reach = _LEAST_HALF_VIEW * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
+    sides = np.array([camera.cx, camera.width - 1 - camera.cx, camera.cy, camera.height - 1 - camera.cy])
+    offsets = reach * sides[:, None] / [camera.fx, camera.fy]
+    if not np.isfinite(lens.unproject(offsets)).all():
+        said = ", ".join(f"{value:g}" for value in lens.coefficients)
+        raise CameraError(
+            f"a lens of the model {lens.model!r} with [{said}] ({' '.join(WIDE_MODELS[lens.model])}) turns "
+            f"back {math.degrees(lens.widest_rad):.0f} degrees off the optical axis, less than half way to "
+            "an edge of the image: check the order of its numbers"
+        )
 
 
 def _check_focal_lengths(camera: Pinhole) -> None:
@@ -228,15 +271,19 @@ def _check_distortion(camera: Pinhole) -> list[str]:
 
 
 def _named(camera: Pinhole) -> str:
-    return "distortion [" + ", ".join(f"{value:g}" for value in camera.distortion) + "] (k1 k2 p1 p2 k3)"
+    names = "k1 k2 p1 p2 k3" + (" k4 k5 k6" if len(camera.distortion) > 5 else "")
+    return "distortion [" + ", ".join(f"{value:g}" for value in camera.distortion) + f"] ({names})"
 
 
 def _distorted(camera: Pinhole, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Raw pixels ``(N, 2)`` of undistorted ones: Brown's model, written out."""
     x, y = ((points_px - [camera.cx, camera.cy]) / [camera.fx, camera.fy]).T
-    k1, k2, p1, p2, k3 = camera.distortion
+    k1, k2, p1, p2, k3, *rational = camera.distortion
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if rational:
+        k4, k5, k6 = rational
+        radial = radial / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     distorted_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
     distorted_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
     return np.stack([camera.fx * distorted_x + camera.cx, camera.fy * distorted_y + camera.cy], axis=1)

@@ -16,11 +16,13 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from slamdepth.cli import (
+    calibrate,
     data_stats,
     depth,
     eval_depth,
     evaluate,
     evaluate_mesh,
+    info,
     localize,
     merge,
     run,
@@ -46,7 +48,9 @@ app = typer.Typer(
 app.command("run")(run.run_command)
 app.command("localize")(localize.localize_command)
 app.command("merge")(merge.merge_command)
+app.command("info")(info.info_command)
 app.command("scale")(scale.scale_command)
+app.command("calibrate")(calibrate.calibrate_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)
 app.command("evaluate-mesh")(evaluate_mesh.evaluate_mesh_command)

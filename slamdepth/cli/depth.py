@@ -14,6 +14,7 @@ from slamdepth.cli.options import (
     DepthOption,
     DepthWeightsOption,
     DeviceOption,
+    FollowLinksOption,
     MaxFramesOption,
     StrideOption,
 )
@@ -39,6 +40,7 @@ def depth_command(
     depth: DepthOption = "auto",
     depth_weights: DepthWeightsOption = None,
     camera: CameraOption = None,
+    follow_links: FollowLinksOption = False,
     max_frames: MaxFramesOption = None,
     stride: StrideOption = 1,
     colour_range: Annotated[
@@ -69,6 +71,7 @@ def depth_command(
 
     Ctrl-C keeps what is done; the same command goes on from there.
     """
+    from slamdepth.datasets import ReadOptions
     from slamdepth.pipeline.depth_maps import DepthMapOptions, make_depth_maps
 
     options = DepthMapOptions(
@@ -83,6 +86,7 @@ def depth_command(
         cloud=not no_cloud,
         device=device,
         overwrite=overwrite,
+        reading=ReadOptions(follow_links=follow_links),
     )
     with stop_on_signals() as stop, JobBar(quiet) as bar:
         result = make_depth_maps(options, progress=bar.show, stop=stop)

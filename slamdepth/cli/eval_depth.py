@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, show_log
-from slamdepth.cli.options import CameraOption, DepthWeightsOption, DeviceOption
+from slamdepth.cli.options import CameraOption, DepthWeightsOption, DeviceOption, FollowLinksOption
 from slamdepth.cli.signals import Interrupted, telling_what_is_kept
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ def eval_depth_command(
     ],
     depth_weights: DepthWeightsOption = None,
     camera: CameraOption = None,
+    follow_links: FollowLinksOption = False,
     stride: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Evaluate every Nth frame. Default: 10; 1 for training pairs"),
@@ -57,6 +58,7 @@ def eval_depth_command(
     Example: slamdepth eval-depth dinov2 rgbd_dataset_freiburg1_rpy --stride 20 --output rpy.json
     """
     show_log()
+    from slamdepth.datasets import ReadOptions
     from slamdepth.depth.hub_store import is_hub_name
     from slamdepth.depth.registry import create_depth_model
     from slamdepth.errors import ConfigError, SlamdepthError
@@ -72,7 +74,8 @@ def eval_depth_command(
         )
     if output is not None:
         output = writable_file(output, ".json")
-    places = [place for path in data for place in open_depth_data(path, camera=camera)]
+    reading = ReadOptions(follow_links=follow_links)
+    places = [place for path in data for place in open_depth_data(path, camera=camera, reading=reading)]
     network = create_depth_model(model, device=device, weights=depth_weights)
     out = console()
     for line in model_lines(network):

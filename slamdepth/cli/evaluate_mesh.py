@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, print_notes
-from slamdepth.cli.options import CameraOption, MaxFramesOption
+from slamdepth.cli.options import CameraOption, FollowLinksOption, MaxFramesOption
 from slamdepth.cli.progress import JobBar
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def evaluate_mesh_command(
         float, typer.Option(metavar="M", help="Sensor depth beyond this counts as unknown.")
     ] = 4.0,
     camera: CameraOption = None,
+    follow_links: FollowLinksOption = False,
     max_frames: MaxFramesOption = None,
     output: Annotated[
         Path | None,
@@ -69,6 +70,7 @@ def evaluate_mesh_command(
 
     Against a sequence, only what its sensor saw is judged. Surfaces are never fitted to each other.
     """
+    from slamdepth.datasets import ReadOptions
     from slamdepth.errors import ConfigError
     from slamdepth.io import writable_file
     from slamdepth.pipeline.mesh_evaluation import MeshQuestion, evaluate_mesh
@@ -77,7 +79,10 @@ def evaluate_mesh_command(
         raise ConfigError(f"--max-depth must be positive and finite, got {max_depth:g}")
     if output is not None:
         output = writable_file(output, ".json")
-    asked = MeshQuestion(mesh, reference, _alignment(align), trajectory, camera, max_frames, max_depth)
+    reading = ReadOptions(follow_links=follow_links)
+    asked = MeshQuestion(
+        mesh, reference, _alignment(align), trajectory, camera, max_frames, max_depth, reading
+    )
     with JobBar(quiet) as bar:
         found = evaluate_mesh(asked, lambda done, total: bar.show("reading", done, total))
     files = [] if output is None else _write(output, asked, found)

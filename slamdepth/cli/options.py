@@ -37,3 +37,27 @@ MaxFramesOption = Annotated[
 DeviceOption = Annotated[
     str, typer.Option("--device", metavar="cpu|cuda|cuda:N", help="Where the network runs.")
 ]
+TopicOption = Annotated[
+    str | None,
+    typer.Option("--topic", metavar="NAME", help="Image topic of a bag. Default: the likeliest camera"),
+]
+DepthTopicOption = Annotated[
+    str | None,
+    typer.Option("--depth-topic", metavar="NAME", help="Depth topic of a bag. Default: the one next to it"),
+]
+PoseTopicOption = Annotated[
+    str | None,
+    typer.Option(
+        "--pose-topic",
+        metavar="NAME",
+        help="Topic of a bag to take as ground truth: poses, odometry or /tf. Default: none",
+    ),
+]
+FollowLinksOption = Annotated[
+    bool,
+    typer.Option("--follow-links", help="Lists and links of the sequence may lead out of its folder."),
+]
+SecondsOption = Annotated[
+    float | None,
+    typer.Option("--seconds", metavar="S", help="Read no more than S seconds of the recording."),
+]

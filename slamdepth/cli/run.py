@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, print_notes, print_places
-from slamdepth.cli.options import CameraOption, DepthWeightsOption, MaxFramesOption, StrideOption
+from slamdepth.cli.options import (
+    CameraOption,
+    DepthTopicOption,
+    DepthWeightsOption,
+    FollowLinksOption,
+    MaxFramesOption,
+    PoseTopicOption,
+    SecondsOption,
+    StrideOption,
+    TopicOption,
+)
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
 
@@ -32,7 +42,8 @@ def run_command(
         Path | None,
         typer.Argument(
             metavar="SEQ",
-            help="A video, or the folder of a sequence: TUM layout or 7-Scenes.",
+            help="A video, a folder of images or of a known layout, a bag, or a live source such as "
+            "camera:0; 'slamdepth info SEQ' tells what it is.",
             show_default=False,
         ),
     ] = None,
@@ -122,7 +133,12 @@ def run_command(
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="YAML file with settings; options here win.")
     ] = None,
+    topic: TopicOption = None,
+    depth_topic: DepthTopicOption = None,
+    pose_topic: PoseTopicOption = None,
+    follow_links: FollowLinksOption = False,
     max_frames: MaxFramesOption = None,
+    seconds: SecondsOption = None,
     stride: StrideOption = 1,
     dense: Annotated[
         str | None,
@@ -182,6 +198,9 @@ def run_command(
     Example: slamdepth run walk2.mp4 --map runs/walk
 
     Example: slamdepth run --resume runs/walk
+    Example: slamdepth run recording.bag --topic /camera/color/image_raw
+
+    Example: slamdepth run camera:0 --camera webcam.yaml --seconds 60
 
     Ctrl-C finishes the run with the frames it has; a second Ctrl-C aborts it.
     """
@@ -218,6 +237,7 @@ def run_command(
             "map": {"voxel_size_m": voxel_size},
         },
     )
+    from slamdepth.datasets import ReadOptions
     from slamdepth.pipeline import run
 
     with stop_on_signals() as stop, JobBar(quiet) as bar:
@@ -233,6 +253,7 @@ def run_command(
             start_map=start_map,
             map_images=map_images,
             checkpoint_s=checkpoint_every,
+            reading=ReadOptions(topic, depth_topic, pose_topic, follow_links, seconds),
             progress=lambda step: _show(bar, step),
             stop=stop,
         )

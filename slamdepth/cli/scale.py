@@ -14,6 +14,7 @@ from slamdepth.cli.options import (
     DepthOption,
     DepthWeightsOption,
     DeviceOption,
+    FollowLinksOption,
     MaxFramesOption,
     StrideOption,
 )
@@ -34,6 +35,7 @@ def scale_command(
         ),
     ] = False,
     camera: CameraOption = None,
+    follow_links: FollowLinksOption = False,
     stride: StrideOption = 10,
     max_frames: MaxFramesOption = None,
     device: DeviceOption = "cpu",
@@ -55,7 +57,7 @@ def scale_command(
     show_log()
     from rich.progress import Progress
 
-    from slamdepth.datasets import open_dataset
+    from slamdepth.datasets import ReadOptions, open_dataset
     from slamdepth.datasets.sensor_depth import lack_of_depth
     from slamdepth.depth.registry import create_depth_model
     from slamdepth.depth.scale import check_can_fit, fit_scale
@@ -66,7 +68,7 @@ def scale_command(
     from slamdepth.pipeline.sequence_id import sequence_id
     from slamdepth.report import scale_table
 
-    dataset = open_dataset(sequence, camera)
+    dataset = open_dataset(sequence, camera, ReadOptions(follow_links=follow_links))
     if not dataset.has_depth:
         raise DatasetError(
             f"{sequence}: {lack_of_depth(dataset)}, so no scale can be fitted; 'slamdepth run SEQ "

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -34,6 +34,11 @@ class Dataset(Protocol):
         timestamps_s: ``(N,)`` float64 seconds, strictly increasing.
         has_depth: True where sensor depth can be read.
         ground_truth: poses of the camera, or None.
+        truth_source: what ``ground_truth`` is where it was not measured by a second system, such as a
+            scanner's own poses; empty elsewhere.
+        imu_path: inertial data of the same time, as ``--imu`` reads them; None where there are none.
+        layout: name of the reader that opened it; empty where none did.
+        is_live: True where frames come as they are taken: ``len`` grows, and only the next frame can be read.
         notes: what was guessed, dropped or repaired while reading, one line each.
     """
 
@@ -44,6 +49,10 @@ class Dataset(Protocol):
     timestamps_s: NDArray[np.float64]
     has_depth: bool
     ground_truth: Trajectory | None
+    truth_source: str = ""
+    imu_path: Path | None = None
+    layout: str = ""
+    is_live: bool = False
     notes: list[str]
 
     def __len__(self) -> int: ...
@@ -60,8 +69,21 @@ class Dataset(Protocol):
             IndexError: there is no frame ``index``.
             ImageDecodeError: the image, or the depth image asked for, does not decode.
             CameraError: the size of either is not the camera's.
+            SourceEnded: a live source gives no more frames.
         """
         ...
+
+    def files(self) -> Iterable[Path]:
+        """The images and depth images that it reads, where they are files of their own."""
+        return ()
+
+    def close(self) -> list[str]:
+        """Release what is held open, such as a camera; nothing can be read afterwards from a live source.
+
+        Returns:
+            What happened while it was read, one line each.
+        """
+        return []
 
     def __iter__(self) -> Iterator[Frame]:
         """Every frame in order, with sensor depth where there is any; see :meth:`frames`."""

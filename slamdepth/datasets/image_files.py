@@ -6,10 +6,12 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics, exif_focal_35mm, intrinsics_of
 from slamdepth.datasets.orientation import exif_orientation, fitted_camera
+from slamdepth.datasets.virtual_view import as_pinhole
 from slamdepth.errors import DatasetError
 from slamdepth.io import read_image_rgb
 from slamdepth.types import Camera, Frame
@@ -57,7 +59,7 @@ def short_names(images: list[Path]) -> list[str]:
 
 
 def read_image_frame(path: Path, index: int, given: tuple[Camera, str] | None) -> tuple[Frame, Intrinsics]:
-    """Read an image file as an upright frame.
+    """Read an image file as an upright frame, of a wide lens as its pinhole view.
 
     Args:
         index: the frame's index, and its time in seconds.
@@ -76,4 +78,5 @@ def read_image_frame(path: Path, index: int, given: tuple[Camera, str] | None) -
         found = Intrinsics(camera, origin, Certainty.GIVEN)
     else:
         found = intrinsics_of(width, height, exif_focal_35mm(path))
-    return Frame(index, float(index), image_rgb, found.camera), found
+    frame = as_pinhole(Frame(index, float(index), image_rgb, found.camera))
+    return frame, replace(found, camera=frame.camera)

@@ -63,9 +63,9 @@ def exif_orientation(path: Path, notes: list[str] | None = None) -> int:
 def turned_camera(camera: Camera, orientation: int) -> Camera:
     """The camera of upright images, from that of the pixels as they are stored."""
     (a, b), (c, d) = _AXES[orientation]
-    p1, p2 = camera.distortion[2:4]
+    k1, k2, p1, p2, *others = camera.distortion
     # Tangential distortion (p2, p1) turns like a vector.
-    distortion = (*camera.distortion[:2], c * p2 + d * p1, a * p2 + b * p1, camera.distortion[4])
+    distortion = (k1, k2, c * p2 + d * p1, a * p2 + b * p1, *others)
     width, height = (camera.width, camera.height) if a else (camera.height, camera.width)
     u = a * camera.cx + b * camera.cy
     v = c * camera.cx + d * camera.cy
@@ -78,6 +78,7 @@ def turned_camera(camera: Camera, orientation: int) -> Camera:
         cx=u if a + b > 0 else width - 1 + u,
         cy=v if c + d > 0 else height - 1 + v,
         distortion=distortion,
+        lens=None if camera.lens is None else camera.lens.turned(_AXES[orientation]),
     )
 
 
@@ -91,6 +92,14 @@ def turned_image(image: NDArray[_Scalar], orientation: int) -> NDArray[_Scalar]:
     if c + d < 0:
         upright = upright[::-1]
     return np.ascontiguousarray(upright)
+
+
+def turned_rotation(orientation: int) -> NDArray[np.float64]:
+    """``T_upright_stored (4, 4)``, from the frame of a camera whose pixels are stored so to that of upright
+    ones; of orientations that are not mirrored."""
+    T = np.eye(4)
+    T[:2, :2] = _AXES[orientation]
+    return T
 
 
 def fitted_camera(

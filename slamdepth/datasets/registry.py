@@ -9,10 +9,15 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
+from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.base import Dataset
+from slamdepth.datasets.confinement import check_confined, refuse_archive
+from slamdepth.datasets.intrinsics import CameraSource, Certainty
+from slamdepth.datasets.options import ReadOptions
 from slamdepth.datasets.video import VIDEO_ENDINGS
+from slamdepth.datasets.virtual_view import through_view
 from slamdepth.errors import DatasetError
 from slamdepth.registry import Registry
 from slamdepth.types import Camera
@@ -41,6 +46,19 @@ class Reader(Protocol):
         Raises:
             DatasetError: a file is missing or malformed.
             CameraError: the intrinsics are unknown.
+        """
+        ...
+
+
+@runtime_checkable
+class ReaderWithOptions(Reader, Protocol):
+    """A reader that has a use for :class:`~slamdepth.datasets.options.ReadOptions`."""
+
+    def open_with(self, path: Path, camera: Camera | None, options: ReadOptions) -> Dataset:
+        """As :meth:`Reader.open`, which is called with default options.
+
+        Raises:
+            DatasetError, CameraError: as :meth:`Reader.open`.
         """
         ...
 
@@ -80,12 +98,18 @@ def known_readers() -> tuple[Reader, ...]:
     return tuple(READERS.get(name) for name in READERS.names())
 
 
-def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dataset:
+def open_dataset(
+    path: str | Path, camera_file: str | Path | None = None, options: ReadOptions | None = None
+) -> Dataset:
     """Open a sequence, whatever its layout.
 
+    Frames of a wide lens are pinhole views, see :class:`slamdepth.datasets.virtual_view.VirtualView`.
+
     Args:
-        path: the folder, or a video file.
+        path: a folder, a video, a bag, a pattern of images such as ``img_*.png``, or a live source:
+            ``camera:0``, or an address of RTSP or HTTP.
         camera_file: a ``camera.yaml`` that overrules what the folder says or is known for.
+        options: what else is asked, such as the topic of a bag.
 
     Raises:
         DatasetError: it is missing, of no known layout, or its files are
@@ -93,26 +117,49 @@ def open_dataset(path: str | Path, camera_file: str | Path | None = None) -> Dat
         CameraError: the intrinsics are malformed, unknown, or of another image size.
     """
     path = Path(path).expanduser()
+    options = options or ReadOptions()
+    if "\0" in str(path):
+        raise DatasetError(f"{str(path)[:80]!r}: no file has such a name")
+    readers = (*known_readers(), *_last_reader)
     try:
-        if not path.exists():
-            what = "video file" if path.suffix.lower() in VIDEO_ENDINGS else "folder"
-            raise DatasetError(f"{path}: no such {what}")
         camera, camera_notes = None, list[str]()
+        found = next((reader for reader in readers if reader.matches(path)), None)
+        if found is None and not path.exists():
+            what = (
+                "video file" if path.suffix.lower() in VIDEO_ENDINGS else "file" if path.suffix else "folder"
+            )
+            raise DatasetError(f"{path}: no such {what}")
         if camera_file is not None:
             camera = Camera.from_file(Path(camera_file).expanduser(), camera_notes)
-        readers = (*known_readers(), *_last_reader)
-        for reader in readers:
-            if reader.matches(path):
-                _log.info("%s: reading as layout '%s'", path, reader.name)
-                dataset = reader.open(path, camera)
-                dataset.notes[:0] = camera_notes
-                for note in dataset.notes:
-                    _log.info("%s: %s", dataset.name, note)
-                return dataset
+        if found is not None:
+            _log.info("%s: reading as layout '%s'", without_secret(str(path)), found.name)
+            dataset = _opened(found, path, camera, options)
+            if camera_file is not None:
+                dataset.camera_source = CameraSource(Certainty.GIVEN, "--camera")
+            dataset.notes[:0] = camera_notes
+            for note in dataset.notes:
+                _log.info("%s: %s", dataset.name, note)
+            return dataset
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+    refuse_archive(path)
     if not path.is_dir():
         known = ", ".join(ending.removeprefix(".") for ending in VIDEO_ENDINGS)
-        raise DatasetError(f"{path}: is a file; a sequence is a folder or a video ({known})")
+        raise DatasetError(
+            f"{path}: is a file; a sequence is a folder or a video ({known}), or another file that "
+            "docs/inputs.md lists"
+        )
     layouts = "; ".join(f"{reader.name} ({reader.needs})" for reader in readers)
     raise DatasetError(f"{path}: no known sequence layout; known are: {layouts}")
+
+
+def _opened(reader: Reader, path: Path, camera: Camera | None, options: ReadOptions) -> Dataset:
+    if isinstance(reader, ReaderWithOptions):
+        dataset = reader.open_with(path, camera, options)
+    else:
+        dataset = reader.open(path, camera)
+    if not options.follow_links:
+        check_confined(dataset)
+    dataset = through_view(dataset)
+    dataset.layout = reader.name
+    return dataset

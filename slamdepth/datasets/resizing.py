@@ -19,9 +19,13 @@ LONGEST_SIDE_PX = 640
 def reduced_camera(camera: Camera, notes: list[str]) -> Camera:
     """``camera`` for images whose longest side is at most :data:`LONGEST_SIDE_PX`.
 
+    Images of a wide lens keep their size: their pinhole view is made of all their pixels.
+
     Args:
         notes: takes a line where the size changes.
     """
+    if camera.lens is not None:
+        return camera
     share = min(1.0, LONGEST_SIDE_PX / max(camera.width, camera.height))
     width, height = max(1, round(share * camera.width)), max(1, round(share * camera.height))
     if share < 1.0:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -58,6 +59,10 @@ class ImageSequence(Dataset):
 
     def __len__(self) -> int:
         return len(self.image_paths)
+
+    def files(self) -> Iterable[Path]:
+        """See :meth:`slamdepth.datasets.base.Dataset.files`."""
+        return (*self.image_paths, *(path for path in self.depth_paths if path is not None))
 
     def read(self, index: int, *, with_depth: bool = False) -> Frame:
         """Read one frame; see :meth:`slamdepth.datasets.base.Dataset.read`.

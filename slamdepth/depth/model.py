@@ -30,6 +30,7 @@ from slamdepth.depth.preprocess import (
 from slamdepth.depth.registry import register
 from slamdepth.depth.upright import UprightView, roll_rad
 from slamdepth.depth.vanishing import find_lines, manhattan_frames
+from slamdepth.depth.wide_view import middle_view, with_scale_of
 from slamdepth.io import sha256_of
 from slamdepth.types import DepthKind, DepthPrediction, Frame, WeightsInfo
 from slamdepth.typing import Floats
@@ -154,12 +155,22 @@ class Dinov2Depth:
     def predict(self, frame: Frame) -> DepthPrediction:
         """Depth in metres for every raw (not undistorted) pixel of ``frame``.
 
-        Gravity is estimated where the frame does not have it, or only guesses it.
+        Gravity is estimated where the frame does not have it, or only guesses it. A wide view has the scale
+        of its middle, see :mod:`slamdepth.depth.wide_view`.
 
         Raises:
             CameraError: the image is too small or too narrow for the network.
         """
         check_size(frame)
+        whole = self._predict_view(frame)
+        if (found := middle_view(frame)) is None:
+            return whole
+        middle, at = found
+        if whole.gravity is not None:
+            middle = replace(middle, gravity=whole.gravity, gravity_is_guess=False)
+        return with_scale_of(whole, self._predict_view(middle), at)
+
+    def _predict_view(self, frame: Frame) -> DepthPrediction:
         rotations = _Rotations(lambda roll: self._encode(frame, roll))
         if frame.gravity is not None and not frame.gravity_is_guess:
             return replace(self._upright(rotations, frame.gravity), gravity=frame.gravity, gravity_share=1.0)

@@ -6,6 +6,8 @@ from __future__ import annotations
 from slamdepth.io.camera import write_camera
 from slamdepth.io.hashing import sha256_of
 from slamdepth.io.images import (
+    decode_image,
+    decode_image_rgb,
     read_depth_file,
     read_depth_m,
     read_depth_raw,
@@ -16,12 +18,14 @@ from slamdepth.io.images import (
 )
 from slamdepth.io.outputs import writable, writable_file
 from slamdepth.io.ply import encode_ply, write_point_cloud
-from slamdepth.io.text import parse_float, read_lines, replacing, write_json, write_text
+from slamdepth.io.text import parse_float, read_json, read_lines, replacing, write_json, write_text
 from slamdepth.io.trajectory import TrajectoryWriter, format_timestamp, write_tum_trajectory
 from slamdepth.io.trajectory_reader import read_trajectory_pair, read_tum_trajectory
 
 __all__ = [
     "TrajectoryWriter",
+    "decode_image",
+    "decode_image_rgb",
     "encode_ply",
     "format_timestamp",
     "parse_float",
@@ -29,6 +33,7 @@ __all__ = [
     "read_depth_m",
     "read_depth_raw",
     "read_image_rgb",
+    "read_json",
     "read_lines",
     "read_trajectory_pair",
     "read_tum_trajectory",

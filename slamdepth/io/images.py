@@ -40,6 +40,28 @@ def read_image_rgb(path: str | Path, *, upright: bool = True) -> NDArray[np.uint
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
+def decode_image_rgb(data: bytes, what: str) -> NDArray[np.uint8]:
+    """The image in the bytes of a file, such as JPEG or PNG, as ``(H, W, 3)`` uint8 RGB.
+
+    Args:
+        what: names it in messages.
+
+    Raises:
+        ImageDecodeError: they are none, or cut short, or no image.
+    """
+    import cv2
+
+    return np.asarray(cv2.cvtColor(_decoded(data, cv2.IMREAD_COLOR, what), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def decode_image(data: bytes, what: str) -> NDArray[Any]:
+    """The image in the bytes of a file as it is stored, such as 16 bits of grey; see
+    :func:`decode_image_rgb`."""
+    import cv2
+
+    return _decoded(data, cv2.IMREAD_UNCHANGED, what)
+
+
 def read_depth_raw(path: str | Path) -> NDArray[np.uint16]:
     """Read a 16-bit depth image as ``(H, W)`` uint16 in the units of its file.
 
@@ -160,21 +182,25 @@ def _load_npy(path: Path) -> NDArray[Any]:
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:
-    import cv2
-
     try:
         data = path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a null byte in the name
         reason = getattr(error, "strerror", None) or error
         raise ImageDecodeError(f"{path}: cannot be read: {reason}") from error
+    return _decoded(data, flags, str(path))
+
+
+def _decoded(data: bytes, flags: int, what: str) -> NDArray[Any]:
+    import cv2
+
     if not data:
-        raise ImageDecodeError(f"{path}: the image is empty (0 bytes)")
+        raise ImageDecodeError(f"{what}: the image is empty (0 bytes)")
     if is_cut_short(data):
-        raise ImageDecodeError(f"{path}: the image is cut short ({len(data)} bytes)")
+        raise ImageDecodeError(f"{what}: the image is cut short ({len(data)} bytes)")
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error as error:
-        raise ImageDecodeError(f"{path}: the image does not decode: {error.err}") from error
+        raise ImageDecodeError(f"{what}: the image does not decode: {error.err}") from error
     if image is None:
-        raise ImageDecodeError(f"{path}: the image does not decode")
+        raise ImageDecodeError(f"{what}: the image does not decode")
     return image

@@ -26,6 +26,8 @@ STANDARD_GRAVITY = 9.80665
 """m/s^2; what accelerometers call 1 g."""
 
 _FEWEST = 20
+_LARGEST = 1e20
+"""Nanoseconds since 1970 are smaller; NaN is not."""
 _AXES = re.compile(r"(.*?)[_.\-]?([xyz])(?:_?(?:axis|rad.*|deg.*|m.?s.*|g))?")
 _GYRO = ("gyr", "rotationrate", "rotation_rate", "omega", "angular", "angvel", "ang_vel")
 _ACC = ("acc",)
@@ -170,7 +172,7 @@ def _rows(
                 f"{path}:{number}: expected {columns.count} columns of numbers with time, angular velocities "
                 f"and accelerations, found {line[:80]!r}"
             ) from error
-        if all(map(math.isfinite, row)) and (not rows or row[0] > rows[-1][0]):
+        if all(abs(value) < _LARGEST for value in row) and (not rows or row[0] > rows[-1][0]):
             texts.append(fields[columns.time])
             rows.append(row)
     return texts, rows, len(data) - len(rows)

@@ -48,6 +48,22 @@ def read_commented_lines(path: Path) -> list[tuple[int, str]]:
     return [(number, line) for number, line in stripped if line]
 
 
+def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        DatasetError: the file cannot be read or is no JSON; names the line.
+    """
+    try:
+        return json.loads(path.read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except json.JSONDecodeError as error:
+        raise DatasetError(f"{path}:{error.lineno}: not valid JSON: {error.msg}") from error
+    except (ValueError, RecursionError) as error:  # no UTF-8, too many digits, too deeply nested
+        raise DatasetError(f"{path}: not valid JSON: {error}") from error
+
+
 def parse_float(text: str) -> float:
     """``float(text)`` without Python's ``1_000``, which no data file means.
 
@@ -100,7 +116,16 @@ def write_json(path: str | Path, value: Any) -> None:
         OutputError: ``path`` cannot be written.
         TypeError: ``value`` holds something with no meaning in JSON.
     """
-    write_text(path, json.dumps(_jsonable(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(path, json_text(value))
+
+
+def json_text(value: Any) -> str:
+    """``value`` as indented JSON, as :func:`write_json` writes it.
+
+    Raises:
+        TypeError: ``value`` holds something with no meaning in JSON.
+    """
+    return json.dumps(_jsonable(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _jsonable(value: Any) -> Any:

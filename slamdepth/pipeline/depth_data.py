@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slamdepth.datasets import Dataset, open_dataset
+from slamdepth.datasets import Dataset, ReadOptions, open_dataset
 from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.errors import DatasetError
 from slamdepth.pipeline.training_data import SequencePlace, sequence_readers
@@ -21,7 +21,9 @@ logger = logging.getLogger(__name__)
 _SEQUENCE_STRIDE = 10
 
 
-def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
+def open_depth_data(
+    path: Path, *, camera: Path | None = None, reading: ReadOptions | None = None
+) -> list[Place]:
     """Open a folder of images with depth.
 
     It holds training pairs (``camera.json``), a Hypersim scene or a sequence of a known layout, or several of
@@ -31,6 +33,7 @@ def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
         path: absolute, relative to the current folder, or below ``$SLAMDEPTH_DATA``; ``NAME[FIRST-LAST]``
             for some of the numbered pairs in a folder.
         camera: a ``camera.yaml`` for a sequence.
+        reading: how a sequence is opened.
 
     Raises:
         DatasetError: the folder is missing, a file, not to be read, of no known kind, malformed, or has
@@ -48,7 +51,7 @@ def open_depth_data(path: Path, *, camera: Path | None = None) -> list[Place]:
         raise DatasetError(
             f"{path}: no known sequence layout and no other images with depth; known are: {known}"
         )
-    return _with_depth([open_dataset(sequence, camera) for sequence in sequences])
+    return _with_depth([open_dataset(sequence, camera, reading) for sequence in sequences])
 
 
 def _contents(path: Path) -> tuple[list[Path], list[Path]]:

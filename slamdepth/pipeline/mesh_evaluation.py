@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slamdepth.datasets import open_dataset
+from slamdepth.datasets import ReadOptions, open_dataset
 from slamdepth.datasets.sequence import MAX_TIME_DIFFERENCE_S
 from slamdepth.errors import ConfigError, DatasetError
 from slamdepth.evaluation import Surface, SurfaceScore, score_surface, vertex_errors_m
@@ -43,6 +43,7 @@ class MeshQuestion:
         camera_file: a ``camera.yaml`` of the sequence.
         max_frames: of the sequence; None takes all.
         max_depth_m: depth of the sequence beyond it counts as unknown.
+        reading: how the sequence is opened.
     """
 
     mesh: Path
@@ -52,6 +53,7 @@ class MeshQuestion:
     camera_file: Path | None = None
     max_frames: int | None = None
     max_depth_m: float = 4.0
+    reading: ReadOptions | None = None
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ def _against_sequence(
     notes: list[str],
     progress: Callable[[int, int], None] | None,
 ) -> MeshEvaluation:
-    dataset = open_dataset(asked.reference, asked.camera_file)
+    dataset = open_dataset(asked.reference, asked.camera_file, asked.reading)
     align = asked.align or (Alignment.NONE if trajectory is None else Alignment.SIM3)
     T = np.eye(4)
     if align is not Alignment.NONE:

@@ -4,12 +4,17 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from slamdepth.datasets import Dataset
+from slamdepth.datasets.options import ReadOptions
 from slamdepth.errors import ConfigError, SlamdepthError
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.types import TrackingStatus, Trajectory
@@ -33,6 +38,7 @@ class RunOptions:
         start_map: a run whose map this run goes on from.
         map_images: keep images in the map.
         checkpoint_s: seconds from one checkpoint to the next; 0 writes none.
+        reading: how the sequence is opened, such as the topic of a bag.
 
     Raises:
         ConfigError: ``stride`` or ``max_frames`` is below 1.
@@ -48,11 +54,22 @@ class RunOptions:
     start_map: Path | None = None
     map_images: bool = False
     checkpoint_s: float = CHECKPOINT_S
+    reading: ReadOptions = field(default_factory=ReadOptions)
 
     def __post_init__(self) -> None:
         check_frames_asked(self.stride, self.max_frames)
         if not 0.0 <= self.checkpoint_s < math.inf:
             raise ConfigError(f"checkpoints must be 0 or more seconds apart, got {self.checkpoint_s:g}")
+
+    def indices_of(self, dataset: Dataset) -> range:
+        """Which frames of ``dataset`` are read, in order; of a live source, all that there may ever be."""
+        if dataset.is_live:
+            return self.indices(sys.maxsize)
+        times_s = dataset.timestamps_s
+        if self.reading.seconds is None or not len(times_s):
+            return self.indices(len(dataset))
+        end_s = float(times_s[0]) + self.reading.seconds
+        return self.indices(int(np.searchsorted(times_s, end_s, side="right")))
 
     def indices(self, frames: int) -> range:
         """Which of ``frames`` frames are read, in order."""

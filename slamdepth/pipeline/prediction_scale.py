@@ -88,6 +88,8 @@ def check_scale_options(dataset: Dataset, config: Config, indices: Sequence[int]
         raise DatasetError(
             f"{dataset.path}: has neither depth images nor a ground truth trajectory to take the scale from"
         )
+    if scale.baseline_between_s is not None and dataset.is_live:
+        raise ConfigError("--baseline-between: the times of a live source are not known before")
     if scale.baseline_between_s is not None and len(indices):
         first_s, last_s = (float(dataset.timestamps_s[i]) for i in (indices[0], indices[-1]))
         for time_s in scale.baseline_between_s:

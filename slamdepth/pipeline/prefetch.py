@@ -14,7 +14,7 @@ from typing import Any
 
 from slamdepth.datasets import Dataset
 from slamdepth.datasets.base import read_sound
-from slamdepth.errors import ImageDecodeError
+from slamdepth.errors import ImageDecodeError, SourceEnded
 from slamdepth.types import Frame
 
 logger = logging.getLogger(__name__)
@@ -47,6 +47,7 @@ class FramePrefetcher:
     Attributes:
         read_s: seconds spent on reading.
         broken_depth_images: depth images that did not decode.
+        ended: why a live source ended; empty where none did.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class FramePrefetcher:
         self._thread = threading.Thread(target=self._read_all, name="slamdepth-reader", daemon=True)
         self.read_s = 0.0
         self.broken_depth_images = 0
+        self.ended = ""
 
     def __enter__(self) -> FramePrefetcher:
         self._thread.start()
@@ -98,6 +100,9 @@ class FramePrefetcher:
                 item: ReadFrame | Exception = ReadFrame(
                     frame, None if self._prepare is None else self._prepare(frame)
                 )
+            except SourceEnded as error:
+                self.ended = str(error)
+                break
             except Exception as error:  # raised by the thread that iterates
                 item = error
             if not self._put(item):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from slamdepth.config import Config
+from slamdepth.datasets import ReadOptions
 from slamdepth.errors import DatasetError
 from slamdepth.pipeline.checkpoint import read_begun, read_latest
 from slamdepth.pipeline.folder import is_run
@@ -72,6 +73,7 @@ def _asked(
         given = dict(begun["options"])
         for name in ("sequence", "camera_file", "start_map"):
             given[name] = None if given[name] is None else Path(given[name])
+        given["reading"] = ReadOptions(**given["reading"])
         if sequence is not None:
             given["sequence"] = Path(sequence)
         options = RunOptions(output=path, **given)

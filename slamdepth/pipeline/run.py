@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from slamdepth.config import Config, merge
-from slamdepth.datasets import Dataset, open_dataset
+from slamdepth.datasets import Dataset, ReadOptions, open_dataset
+from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.metric import configured_model, with_chosen_model
@@ -77,6 +78,7 @@ def run(
     start_map: str | Path | None = None,
     map_images: bool = False,
     checkpoint_s: float | None = None,
+    reading: ReadOptions | None = None,
     progress: ProgressCallback | None = None,
     stop: threading.Event | None = None,
 ) -> RunResult:
@@ -86,7 +88,8 @@ def run(
     generators of Python, NumPy, OpenCV and, where it is loaded, torch are seeded from ``config.seed``.
 
     Args:
-        sequence: a video, a folder of images, or a folder in the layout of TUM RGB-D or 7-Scenes.
+        sequence: a video, a folder of images or of a known layout, a bag, or a live source such as
+            ``camera:0`` or an address of RTSP; docs/inputs.md lists all.
         output: run folder. Default: ``runs/<sequence>-<time>``.
         depth: name of the depth model, see :func:`slamdepth.create_depth_model`; ``"sensor"`` takes the
             sequence's own depth. Default: as ``config`` says, which is ``"auto"`` unless changed.
@@ -100,6 +103,7 @@ def run(
         map_images: keep the keyframes' images in ``map/``.
         checkpoint_s: seconds from one checkpoint to the next, see :func:`slamdepth.resume`; 0 writes none.
             Default: 15.
+        reading: how the sequence is opened, such as the topic of a bag.
         progress: called after each frame and at the start of each stage.
         stop: set it, from any thread or a signal handler, to finish early with the frames tracked so far.
 
@@ -123,6 +127,7 @@ def run(
         None if start_map is None else Path(start_map),
         map_images,
         CHECKPOINT_S if checkpoint_s is None else checkpoint_s,
+        reading or ReadOptions(),
     )
     return run_job(options, _settings(config, depth), progress, stop)
 
@@ -210,8 +215,10 @@ def _prepare(
 
     config = with_chosen_model(config)
     start_map = None if options.start_map is None else Map.load(options.start_map)
-    dataset = open_dataset(options.sequence, options.camera_file)
-    indices = options.indices(len(dataset))
+    dataset = open_dataset(options.sequence, options.camera_file, options.reading)
+    indices = options.indices_of(dataset)
+    if dataset.imu_path is not None and config.scale.imu is None:
+        dataset.notes.append(f"inertial data is there, for scale and gravity: --imu {dataset.imu_path}")
     check_scale_options(dataset, config, indices)
     if begun is not None and describe(dataset) != begun.sequence:
         raise DatasetError(
@@ -264,8 +271,10 @@ def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threadin
     latest = job.latest
     if latest is None:
         folder.create(_arguments(job.options))
-        begin(folder.path, begun_run(job.options, config, dataset))
-    checkpoints = Checkpoints(folder.path, job.options.checkpoint_s)
+        if not dataset.is_live:
+            begin(folder.path, begun_run(job.options, config, dataset))
+    # what a live source gave cannot be read again
+    checkpoints = Checkpoints(folder.path, 0.0 if dataset.is_live else job.options.checkpoint_s)
     try:
         write_log_to(log, folder / "log.txt", goes_on=latest is not None)
         if latest is not None:
@@ -275,10 +284,9 @@ def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threadin
         if job.scale.fit is not None:
             write_scale(folder / "depth_scale.yaml", job.scale.fit)
         logger.info(
-            "%s: %d of %d frames, depth by %s, %s features",
+            "%s: %s, depth by %s, %s features",
             dataset.path,
-            len(job.indices),
-            len(dataset),
+            "a live source" if dataset.is_live else f"{len(job.indices)} of {len(dataset)} frames",
             job.model.name,
             config.features.name if config.odometry == "orb" else "no",
         )
@@ -437,6 +445,7 @@ def _reported_options(options: RunOptions, tracked: Tracked) -> dict[str, object
     asked = asdict(options)
     for name in ("sequence", "output", "overwrite", "camera_file", "start_map", "checkpoint_s"):
         asked.pop(name)
+    asked["reading"] = {name: value for name, value in asked["reading"].items() if value}
     return {
         **asked,
         "camera_file": options.camera_file is not None,
@@ -447,7 +456,7 @@ def _reported_options(options: RunOptions, tracked: Tracked) -> dict[str, object
 
 def _arguments(options: RunOptions) -> list[str]:
     """What the command line was given, without the settings and the run folder."""
-    arguments = [str(options.sequence)]
+    arguments = [without_secret(str(options.sequence))]
     if options.camera_file is not None:
         arguments += ["--camera", str(options.camera_file)]
     if options.max_frames is not None:
@@ -458,6 +467,7 @@ def _arguments(options: RunOptions) -> list[str]:
         arguments += ["--map", str(options.start_map)]
     if options.map_images:
         arguments.append("--map-images")
+    arguments += options.reading.arguments()
     return arguments if options.mesh else [*arguments, "--no-mesh"]
 
 
@@ -465,7 +475,7 @@ def _settings_text(options: RunOptions, config: Config) -> str:
     camera = "none" if options.camera_file is None else Path(options.camera_file).name
     lines = [
         "# The settings of this run; 'slamdepth run SEQ --config' reads them back. These are not read back:",
-        f"# sequence: {Path(options.sequence).name}, --camera: {camera}",
+        f"# sequence: {Path(without_secret(str(options.sequence))).name}, --camera: {camera}",
         f"# stride: {options.stride}, max frames: {options.max_frames}, mesh: {options.mesh}",
         "# For the same run again, give them again; README.txt has the command.",
     ]

@@ -7,6 +7,7 @@ import numpy as np
 
 from slamdepth.datasets import Dataset
 from slamdepth.datasets.sequence import ImageSequence, is_file
+from slamdepth.datasets.virtual_view import ViewedSequence
 from slamdepth.training.data import fingerprint
 
 
@@ -15,6 +16,8 @@ def sequence_id(dataset: Dataset) -> str:
 
     Names of folders are not enough: all sequences of 7-Scenes are called seq-NN.
     """
+    if isinstance(dataset, ViewedSequence):
+        dataset = dataset.raw
     if isinstance(dataset, ImageSequence):
         files = [path for path in dataset.image_paths if is_file(path)]
     else:

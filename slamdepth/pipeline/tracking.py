@@ -24,6 +24,9 @@ from slamdepth.types import Frame, StepResult
 
 logger = logging.getLogger(__name__)
 
+_ENDLESS = 10**12
+"""More frames than any recording has."""
+_FEWEST_JUDGED = 40
 _WARNINGS = 5  # images named one by one before only their number is logged
 
 
@@ -89,8 +92,12 @@ def track(
     """
     before = before or Progress()
     left = indices[len(indices) if before.is_complete else before.done :]
-    reader = FramePrefetcher(dataset, left, with_depth=with_depth, prepare=tracker.prepare)
-    run = _Run(reader, len(indices), before)
+    # what is read ahead of a live source would be late
+    capacity = 1 if dataset.is_live else 8
+    reader = FramePrefetcher(
+        dataset, left, with_depth=with_depth, prepare=tracker.prepare, capacity=capacity
+    )
+    run = _Run(reader, 0 if len(indices) > _ENDLESS else len(indices), before)
     progress(RunProgress(RunStage.TRACKING, before.done, run.total))
     with reader, TrajectoryWriter(online_path) as writer:
         online = _Online(writer)
@@ -109,10 +116,13 @@ def track(
             if checkpoints is not None and checkpoints.is_due and isinstance(tracker, Tracker):
                 _checkpoint(tracker, checkpoints, run)
             progress(run.state(result))
+    run.is_interrupted = stop.is_set() and (run.done < run.total or not run.total)
+    run.source_notes = [reader.ended] if reader.ended else []
+    run.source_notes += dataset.close() if dataset.is_live else []
     if not run.steps:
         if stop.is_set():
             raise RunInterrupted("interrupted before the first frame; nothing was saved")
-        raise DatasetError(f"{dataset.path}: none of the {run.total} images decodes")
+        raise DatasetError(reader.ended or f"{dataset.path}: none of the {run.total} images decodes")
     progress(replace(run.state(run.steps[-1]), stage=RunStage.OPTIMISING))
     if checkpoints is not None and isinstance(tracker, Tracker):
         tracker.complete()
@@ -122,11 +132,19 @@ def track(
 
 
 class _Run:
-    """The frames of a run so far."""
+    """The frames of a run so far.
+
+    Attributes:
+        total: frames there are; 0 of a live source, which has no length.
+        is_interrupted: it was stopped before the last frame.
+        source_notes: what the source says of itself at its end.
+    """
 
     def __init__(self, reader: FramePrefetcher, total: int, before: Progress) -> None:
         self.reader = reader
         self.total = total
+        self.is_interrupted = False
+        self.source_notes: list[str] = []
         self.steps = list(before.steps)
         self.skipped = before.skipped
         self.start_s: float | None = time.perf_counter() - before.elapsed_s if before.steps else None
@@ -150,7 +168,7 @@ class _Run:
         """Count an image that cannot be read; refuse the sequence where half of them cannot."""
         self.skipped += 1
         _warn(error, self.skipped)
-        if 2 * self.skipped > self.total:
+        if 2 * self.skipped > (self.total or max(_FEWEST_JUDGED, self.done)):
             raise DatasetError(
                 f"{dataset.path}: more than half of the images do not decode "
                 f"({self.skipped} of the first {self.done}); the last: {error}"
@@ -182,12 +200,13 @@ class _Run:
     def notes(self) -> list[str]:
         """What a reader of the result should know."""
         notes: list[str] = []
-        if self.done < self.total:
-            notes.append(f"interrupted after {self.done} of {self.total} frames")
+        if self.is_interrupted:
+            of_all = f"interrupted after {self.done} of {self.total} frames"
+            notes.append(of_all if self.total else f"stopped after {self.done} frames")
+        notes += self.source_notes
         if self.skipped:
-            notes.append(
-                f"{self.skipped} of {self.total} images do not decode or are missing, and were skipped"
-            )
+            of = self.total or self.done
+            notes.append(f"{self.skipped} of {of} images do not decode or are missing, and were skipped")
         if self.reader.broken_depth_images:
             notes.append(f"{self.reader.broken_depth_images} depth images do not decode and were left out")
         return notes
@@ -219,7 +238,7 @@ def _finished(tracker: AnyTracker, run: _Run) -> Tracked:
         tuple(run.steps),
         frames / run.elapsed_s,
         run.skipped,
-        run.done < run.total,
+        run.is_interrupted,
         tuple(notes),
     )
 

@@ -93,7 +93,7 @@ def _merged(first: Map, second: Map, config: Config, workers: Workers, watch: St
     if not atlas.join(there, agreeing):
         return None
     joined = atlas.active
-    optimise_map(joined.map, joined.integration, joined.frames, joined.shutter, config, is_loaded=True)
+    optimise_map(joined, config)
     sessions: tuple[Session, ...] = (*first.sessions, *second.sessions)
     saved = save_merged(joined, first, sessions)
     return Merged(saved, len(agreeing), scale)

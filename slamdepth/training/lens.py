@@ -33,8 +33,14 @@ def raw_pixels(rays: Floats, camera: Camera) -> Floats:
 
 def turning_point(camera: Camera) -> float:
     """The ray slope beyond which the radial distortion of ``camera`` folds back; infinity if never."""
-    k1, k2, _, _, k3 = camera.distortion
+    k1, k2, _, _, k3, *rational = camera.distortion
     r2 = np.linspace(0.0, _STEEPEST, 4001) ** 2
     slope = 1.0 + 3.0 * k1 * r2 + 5.0 * k2 * r2**2 + 7.0 * k3 * r2**3
+    if rational:
+        k4, k5, k6 = rational
+        above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        slope = slope * below - above * 2.0 * r2 * (k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6))
+        slope = np.where(below > 0, slope, 0.0)
     turned = np.flatnonzero(slope <= 0)
     return float(np.sqrt(r2[turned[0]])) if len(turned) else np.inf

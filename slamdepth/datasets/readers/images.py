@@ -36,8 +36,11 @@ class ImagesReader:
         return has_images(path) and not (path / PAIRS_FILE).exists()
 
     def open(self, path: Path, camera: Camera | None) -> FolderSequence:
+        return self.open_list(path, tuple(list_images(path)), camera)
+
+    def open_list(self, path: Path, images: tuple[Path, ...], camera: Camera | None) -> FolderSequence:
+        """Open some images of the folder ``path`` in this order; see :meth:`open`."""
         notes: list[str] = []
-        images = tuple(list_images(path))
         _check_names(path, images)
         sample_path, sample_shape = first_image(images)
         _check_no_depth(sample_path)

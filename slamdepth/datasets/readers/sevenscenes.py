@@ -17,11 +17,10 @@ import numpy as np
 
 from slamdepth.calibration import CAMERA_FILE
 from slamdepth.datasets.orientation import exif_orientation, fitted_camera
+from slamdepth.datasets.poses import read_matrix, trajectory_of
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import ImageSequence, first_image
 from slamdepth.errors import DatasetError
-from slamdepth.geometry import orthonormalised
-from slamdepth.io import parse_float, read_lines
 from slamdepth.types import Camera, Trajectory
 
 if TYPE_CHECKING:
@@ -79,34 +78,6 @@ class SevenScenesReader:
         )
 
 
-def read_pose(path: Path) -> NDArray[np.float64] | None:
-    """Read a ``(4, 4)`` camera-to-world pose; None where tracking was lost (NaN, infinity, zeros).
-
-    Raises:
-        DatasetError: the file does not hold four lines of four numbers; names file and line.
-    """
-    rows: list[list[float]] = []
-    number = 1
-    for number, line in read_lines(path):
-        try:
-            row = [parse_float(text) for text in line.replace(",", " ").split()]
-        except ValueError:
-            row = []
-        if len(row) != 4 or len(rows) == 4:
-            raise DatasetError(f"{path}:{number}: expected four lines of four numbers, found {line[:80]!r}")
-        rows.append(row)
-    if len(rows) != 4:
-        raise DatasetError(f"{path}:{number}: expected four lines of four numbers, the file has {len(rows)}")
-    T = np.array(rows, dtype=np.float64)
-    if not np.isfinite(T).all() or np.abs(T).max() > 1e6 or not np.allclose(T[3], [0, 0, 0, 1], atol=1e-3):
-        return None
-    R = T[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-2) or np.linalg.det(R) < 0:
-        return None
-    T[3] = [0, 0, 0, 1]
-    return orthonormalised(T)
-
-
 def _find_frames(path: Path) -> dict[int, Path]:
     frames: dict[int, Path] = {}
     for image in sorted(path.glob("frame-*.color.*")):
@@ -125,24 +96,9 @@ def _sibling(image_path: Path, ending: str) -> Path | None:
 def _read_poses(
     image_paths: tuple[Path, ...], timestamps_s: NDArray[np.float64], notes: list[str]
 ) -> Trajectory | None:
-    times_s: list[float] = []
-    poses: list[NDArray[np.float64]] = []
-    invalid = missing = 0
-    for image_path, time_s in zip(image_paths, timestamps_s, strict=True):
-        pose_path = _sibling(image_path, ".pose.txt")
-        T_world_camera = None if pose_path is None else read_pose(pose_path)
-        if T_world_camera is not None:
-            times_s.append(float(time_s))
-            poses.append(T_world_camera)
-        elif pose_path is not None:
-            invalid += 1
-        else:
-            missing += 1
-    if invalid:
-        notes.append(f"{invalid} invalid poses (NaN, infinity, no rotation) dropped from the ground truth")
-    if missing and (poses or invalid):
-        notes.append(f"{missing} of {len(image_paths)} frames have no pose.txt")
-    return Trajectory(np.array(times_s), np.stack(poses)) if poses else None
+    paths = (_sibling(image_path, ".pose.txt") for image_path in image_paths)
+    poses = [None if path is None else read_matrix(path, 4, rows=4) for path in paths]
+    return trajectory_of(timestamps_s, poses, notes, missing="pose.txt")
 
 
 def _find_camera(path: Path, camera: Camera | None, notes: list[str]) -> Camera:

@@ -82,6 +82,7 @@ def make_depth_maps(
         camera_file=options.camera_file,
         stride=options.stride,
         max_frames=options.max_frames,
+        reading=options.reading,
     )
     folder = DepthFolder.plan(options.output, source.name, is_flat=source.kind is SourceKind.IMAGE)
     model = create_depth_model(options.depth, device=options.device, weights=options.weights)

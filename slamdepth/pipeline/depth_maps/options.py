@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from slamdepth.datasets import ReadOptions
 from slamdepth.errors import ConfigError, SlamdepthError
 from slamdepth.pipeline.options import check_frames_asked
 
@@ -29,6 +30,7 @@ class DepthMapOptions:
         cloud: also write point clouds, by far the largest files.
         device: where the network runs.
         overwrite: earlier depth maps in ``output`` may be replaced.
+        reading: how a sequence is opened.
 
     Raises:
         ConfigError: a number is out of range.
@@ -45,6 +47,7 @@ class DepthMapOptions:
     cloud: bool = True
     device: str = "cpu"
     overwrite: bool = False
+    reading: ReadOptions | None = None
 
     def __post_init__(self) -> None:
         check_frames_asked(self.stride, self.max_frames)

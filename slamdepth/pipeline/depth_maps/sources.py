@@ -14,11 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from slamdepth.datasets import Dataset, known_readers, open_dataset
+from slamdepth.datasets import Dataset, ReadOptions, known_readers, open_dataset
 from slamdepth.datasets.image_files import IMAGE_ENDINGS, list_images, read_image_frame, short_names
 from slamdepth.datasets.intrinsics import Certainty, Intrinsics, find_camera_file, intrinsics_of
 from slamdepth.datasets.orientation import fitted_camera
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
+from slamdepth.datasets.virtual_view import as_pinhole
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.pipeline.sequence_id import sequence_id
 from slamdepth.training.data import fingerprint
@@ -87,12 +88,20 @@ class Source(Protocol):
         ...
 
 
-def open_source(path: Path, *, camera_file: Path | None, stride: int, max_frames: int | None) -> Source:
+def open_source(
+    path: Path,
+    *,
+    camera_file: Path | None,
+    stride: int,
+    max_frames: int | None,
+    reading: ReadOptions | None = None,
+) -> Source:
     """Find out what ``path`` is and open it.
 
     Args:
         camera_file: a ``camera.yaml`` that overrules whatever else is known of the camera.
         stride, max_frames: every Nth image, and at most this many.
+        reading: how a sequence is opened.
 
     Raises:
         DatasetError: nothing is there, or nothing in it can be read.
@@ -103,7 +112,7 @@ def open_source(path: Path, *, camera_file: Path | None, stride: int, max_frames
     try:
         if path.is_dir():
             if any(reader.matches(path) for reader in known_readers()):
-                return _SequenceSource(open_dataset(path, camera_file), chosen)
+                return _SequenceSource(open_dataset(path, camera_file, reading), chosen)
             if (path / "camera.json").is_file():
                 return _PairSource(PairReader().open(path), camera_file, chosen)
             return _ImageSource(SourceKind.IMAGES, path, list_images(path)[chosen], camera_file)
@@ -115,6 +124,8 @@ def open_source(path: Path, *, camera_file: Path | None, stride: int, max_frames
         return _VideoSource(VideoFile(path), camera_file, chosen)
     if path.suffix.lower() in IMAGE_ENDINGS:
         return _ImageSource(SourceKind.IMAGE, path, [path], camera_file)
+    if any(reader.matches(path) for reader in known_readers()):  # a bag, say
+        return _SequenceSource(open_dataset(path, camera_file, reading), chosen)
     known = ", ".join(ending.removeprefix(".") for ending in (*IMAGE_ENDINGS, *VIDEO_ENDINGS))
     raise DatasetError(f"{path}: neither a folder nor an image nor a video by its ending; known are {known}")
 
@@ -178,8 +189,8 @@ class _VideoSource:
             self.notes.append(note)
 
     def _read(self, index: int, decode: Callable[[], NDArray[np.uint8]]) -> tuple[Frame, Intrinsics]:
-        frame = Frame(index, index / self._video.fps, decode(), self._intrinsics.camera)
-        return frame, self._intrinsics
+        frame = as_pinhole(Frame(index, index / self._video.fps, decode(), self._intrinsics.camera))
+        return frame, replace(self._intrinsics, camera=frame.camera)
 
 
 class _PairSource:
