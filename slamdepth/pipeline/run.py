@@ -43,6 +43,7 @@ from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.surface import score_mesh
 from slamdepth.pipeline.tracking import AnyTracker, Tracked, track
 from slamdepth.report import MeshCounts, MeshImage, ReportData, render_errors, write_report
+from slamdepth.report.scene import SCENE_FILE, scene_of, write_scene
 
 logger = logging.getLogger(__name__)
 
@@ -223,7 +224,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
         mesh, mesh_images, mesh_notes = write_mesh(folder, 1, reconstruction, config, tell)
         notes += mesh_notes
     is_measured = job.depth_is_measured
-    others, other_notes = finish_others(
+    others, other_meshes, other_notes = finish_others(
         dataset,
         others,
         config,
@@ -258,6 +259,12 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     absent = {name for name, is_there in optional if not is_there}
     files = {name: what for name, what in FILES.items() if name not in absent}
     tell(RunProgress(RunStage.REPORTING))
+    scene = scene_of(
+        replace(reconstruction, others=tuple(one.reconstruction for one in others)),
+        (mesh, *other_meshes),
+        (trajectory_score, *(one.trajectory_score for one in others)),
+    )
+    write_scene(folder / SCENE_FILE, scene)
     summary = write_report(
         folder.path,
         ReportData(
@@ -277,6 +284,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
             surface_scores=surface_scores,
             others=others,
             mesh_images=mesh_images,
+            scene=scene,
             skipped_frames=tracked.skipped,
             readable_frames=len(dataset),
             promised_frames=getattr(dataset, "frames_promised", len(dataset)),
