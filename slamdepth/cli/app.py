@@ -16,15 +16,18 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from slamdepth.cli import (
+    compare,
     data_stats,
     depth,
     eval_depth,
     evaluate,
     evaluate_mesh,
+    render,
     run,
     scale,
     synth,
     train,
+    view,
     weights,
 )
 from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_verbose
@@ -42,6 +45,9 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("run")(run.run_command)
+app.command("view")(view.view_command)
+app.command("compare")(compare.compare_command)
+app.command("render")(render.render_command)
 app.command("scale")(scale.scale_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)

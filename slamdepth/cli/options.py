@@ -37,3 +37,12 @@ MaxFramesOption = Annotated[
 DeviceOption = Annotated[
     str, typer.Option("--device", metavar="cpu|cuda|cuda:N", help="Where the network runs.")
 ]
+PortOption = Annotated[
+    int, typer.Option("--port", metavar="N", help="Port of the viewer's web page; 0 takes a free one.")
+]
+HostOption = Annotated[
+    str,
+    typer.Option(
+        "--host", metavar="ADDRESS", help="Address it listens at; by default only this machine reaches it."
+    ),
+]

@@ -9,9 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, print_notes, print_places
-from slamdepth.cli.options import CameraOption, DepthWeightsOption, MaxFramesOption, StrideOption
+from slamdepth.cli.options import (
+    CameraOption,
+    DepthWeightsOption,
+    MaxFramesOption,
+    PortOption,
+    StrideOption,
+)
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
+from slamdepth.cli.view import live_view
 
 if TYPE_CHECKING:
     from slamdepth.config import Config
@@ -140,6 +147,11 @@ def run_command(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier run in the output folder.")
     ] = False,
+    view: Annotated[
+        bool,
+        typer.Option("--view", help="Show the map in the browser while it grows; needs the extra 'viewer'."),
+    ] = False,
+    port: PortOption = 8080,
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -181,7 +193,7 @@ def run_command(
     )
     from slamdepth.pipeline import run
 
-    with stop_on_signals() as stop, JobBar(quiet) as bar:
+    with stop_on_signals() as stop, live_view(port if view else None) as watcher, JobBar(quiet) as bar:
         result = run(
             sequence,
             output,
@@ -193,6 +205,7 @@ def run_command(
             overwrite=overwrite,
             progress=lambda step: _show(bar, step),
             stop=stop,
+            watcher=watcher,
         )
     _print_result(result, quiet)
 

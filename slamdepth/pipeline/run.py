@@ -41,7 +41,7 @@ from slamdepth.pipeline.prediction_scale import (
 from slamdepth.pipeline.results import judge_health, judge_trajectory, score_depth
 from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.surface import score_mesh
-from slamdepth.pipeline.tracking import AnyTracker, Tracked, track
+from slamdepth.pipeline.tracking import AnyTracker, Tracked, Watcher, track
 from slamdepth.report import MeshCounts, MeshImage, ReportData, render_errors, write_report
 from slamdepth.report.scene import SCENE_FILE, scene_of, write_scene
 
@@ -61,6 +61,7 @@ def run(
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
     stop: threading.Event | None = None,
+    watcher: Watcher | None = None,
 ) -> RunResult:
     """Track a sequence, mesh it, score it, and write everything into a run folder.
 
@@ -80,6 +81,7 @@ def run(
         overwrite: an earlier run in ``output`` may be replaced.
         progress: called after each frame and at the start of each stage.
         stop: set it, from any thread or a signal handler, to finish early with the frames tracked so far.
+        watcher: its ``saw(frame, result, tracker)`` is called after each frame, and must return at once.
 
     Returns:
         The folder, the figures of the report, and the reconstruction.
@@ -105,7 +107,7 @@ def run(
     with run_log() as log:
         job = _prepare(options, settings, tell, stopped)
         with job.tracker:
-            tracked = _track(job, log, tell, stopped)
+            tracked = _track(job, log, tell, stopped, watcher)
         return _finish(job, tracked, tell)
 
 
@@ -172,7 +174,9 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     return _Job(options, config, dataset, indices, folder, model, scale, tracker)
 
 
-def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threading.Event) -> Tracked:
+def _track(
+    job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threading.Event, watcher: Watcher | None
+) -> Tracked:
     """Make the run folder and feed the tracker; bad images leave no folder behind."""
     config, dataset, folder = job.config, job.dataset, job.folder
     folder.create(_arguments(job.options))
@@ -197,6 +201,7 @@ def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threadin
             with_depth=job.depth_is_measured,
             progress=tell,
             stop=stop,
+            watcher=watcher,
         )
     except SlamdepthError as error:
         if not isinstance(error, OutputError):  # of a full disk, say, what is there is worth keeping

@@ -18,6 +18,7 @@ from slamdepth.io import TrajectoryWriter
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.pipeline.options import ProgressCallback, RunInterrupted, RunProgress, RunStage
 from slamdepth.pipeline.prefetch import FramePrefetcher
+from slamdepth.tracking.snapshot import Watched
 from slamdepth.types import Frame, StepResult
 
 logger = logging.getLogger(__name__)
@@ -25,7 +26,7 @@ logger = logging.getLogger(__name__)
 _WARNINGS = 5  # images named one by one before only their number is logged
 
 
-class AnyTracker(Protocol):
+class AnyTracker(Watched, Protocol):
     """What the pipeline needs of a tracker."""
 
     def prepare(self, frame: Frame) -> Any: ...
@@ -39,6 +40,13 @@ class AnyTracker(Protocol):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
+
+
+class Watcher(Protocol):
+    """Whoever watches a run, such as a viewer; must return at once."""
+
+    def saw(self, frame: Frame, result: StepResult, tracker: Watched) -> None:
+        """Called after each frame, in the thread of the tracker."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,7 @@ def track(
     with_depth: bool,
     progress: ProgressCallback,
     stop: threading.Event,
+    watcher: Watcher | None = None,
 ) -> Tracked:
     """Feed the frames to ``tracker`` until the last one or until ``stop`` is set, and finish it.
 
@@ -110,6 +119,8 @@ def track(
                         f"from here on in the world frame of map {map_id + 1}, as maps were started"
                     )
                 online.append(result.timestamp_s, result.T_world_camera)
+            if watcher is not None:
+                watcher.saw(item.frame, result, tracker)
             progress(_state(result, len(steps) + skipped, total, len(steps), start_s))
     if start_s is None:
         if stop.is_set():
