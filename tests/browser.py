@@ -115,6 +115,9 @@ class Page:
 
     def open(self, address: str) -> None:
         self.call("Page.navigate", url=address)
+        self.wait_for(
+            f"location.href.startsWith({json.dumps(address)}) && document.readyState === 'complete'"
+        )
 
     def run(self, script: str) -> Any:
         """The value of an expression."""

@@ -4,13 +4,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
+from command_line import leave_out_plots
 from report_data import full_data, several_maps_data
 
+from slamdepth.io import write_tum_trajectory
 from slamdepth.mapping.mesh import Mesh
-from slamdepth.report import ReportData
-from slamdepth.report.scene import Scene, scene_of
+from slamdepth.report import ReportData, write_report
+from slamdepth.report.scene import SCENE_FILE, Scene, scene_of, write_scene
 
 RED, GREEN, BLUE = (200, 40, 40), (40, 170, 60), (50, 60, 190)
 
@@ -61,3 +65,19 @@ def several_maps_with_scene() -> ReportData:
     first, *rest = run.others
     others = (replace(first, keyframes=run.keyframes[:3]), *rest)
     return replace(data, scene=scene_of(replace(run, others=others), [room_mesh(), None, None], []))
+
+
+def write_run(folder: Path) -> Path:
+    """The folder of a made-up run, as the pipeline writes it."""
+    folder.mkdir()
+    data = data_with_scene()
+    assert data.scene is not None
+    one = data.scene.maps[0]
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out_plots(patch)
+        write_report(folder, data)
+    write_scene(folder / SCENE_FILE, data.scene)
+    write_tum_trajectory(folder / "trajectory.txt", one.path)
+    write_tum_trajectory(folder / "keyframes.txt", one.keyframes)
+    room_mesh().save(folder / "mesh.ply")
+    return folder

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _BUSY = 0.03  # most of the time of one core that sending may take
 _SHORTEST_S = 0.25  # between two pictures
 _MOST_POINTS = 20_000
+_GROWN = 1.3  # factor on its size from which on a map is looked at anew
 _WIDTH_PX = 256
 _STATUS = {"tracking": "tracking", "lost": "**lost**"}
 
@@ -55,8 +56,7 @@ class LiveView:
         self._is_wanted = threading.Event()
         self._arrived = threading.Event()
         self._closed = False
-        self._is_aimed = False
-        self._map_id = -1
+        self._aims: dict[int, tuple[int, Floats, float]] = {}  # of each browser: map, eye, size
         self._handles: dict[str, Any] = {}
         self._text = server.gui.add_markdown("waiting for the first keyframe")
         blank = np.zeros((3, 4, 3), np.uint8)
@@ -147,22 +147,30 @@ class LiveView:
                 **field_of_view(news.aspect),
                 scale=0.06 * size,
                 color=NOW,
+                thickness=2.5,
+                thickness_units="screen",
                 image=news.image_rgb,
                 format="jpeg",
                 **placed(news.T_world_camera),
             )
-        if snapshot.map_id != self._map_id:
-            self._map_id = snapshot.map_id
-            self._aim(snapshot.T_world_camera[0], size)
+        self._aim(snapshot, size)
 
-    def _aim(self, T_world_camera: Floats, size: float) -> None:
-        """Look from behind and above the first camera; up is up in its image."""
-        right, down, ahead = T_world_camera[:3, :3].T
-        del right
-        self._server.scene.set_up_direction(-down)
-        for client in self._server.get_clients().values():
-            client.camera.position = T_world_camera[:3, 3] - 0.8 * size * ahead - 0.7 * size * down
-            client.camera.look_at = T_world_camera[:3, 3] + 0.5 * size * ahead
+    def _aim(self, snapshot: MapSnapshot, size: float) -> None:
+        """Look from behind and above the first camera, up in its image; again as the map grows, unless the
+        user has moved the view."""
+        start = snapshot.T_world_camera[0]
+        _, down, ahead = start[:3, :3].T
+        for number, client in self._server.get_clients().items():
+            map_id, before, aimed_size = self._aims.get(number, (-1, np.zeros(3), 0.0))
+            if map_id == snapshot.map_id:
+                was_moved = np.linalg.norm(client.camera.position - before) > 0.02 * aimed_size
+                if was_moved or size < _GROWN * aimed_size:
+                    continue
+            eye = start[:3, 3] - 0.6 * size * ahead - 0.5 * size * down
+            client.camera.up_direction = -down
+            client.camera.position = eye
+            client.camera.look_at = start[:3, 3] + 0.4 * size * ahead
+            self._aims[number] = (snapshot.map_id, eye, size)
 
 
 def _size(points: Floats) -> float:

@@ -137,6 +137,8 @@ class RunView:
                     f"{name}/images/{thumbnail.row}",
                     **field_of_view(self._scene.aspect),
                     scale=2 * _KEYFRAME * size,
+                    thickness=1.2,
+                    thickness_units="screen",
                     color=PATH,
                     image=_decoded(thumbnail.image),
                     **placed(one.keyframes.T_world_camera[thumbnail.row]),
@@ -170,7 +172,13 @@ class RunView:
         low_to_high = f"depth, {self._scene.near_m:.1f} (dark) to {self._scene.far_m:.1f} m (yellow)"
         self._depth = gui.add_image(blank, label=low_to_high, format="jpeg", visible=is_there)
         self._now = scene.add_camera_frustum(
-            "/now", **field_of_view(self._scene.aspect), scale=0.1, color=NOW, visible=False
+            "/now",
+            **field_of_view(self._scene.aspect),
+            scale=0.1,
+            thickness=2.5,
+            thickness_units="screen",
+            color=NOW,
+            visible=False,
         )
         self.show(0)
 

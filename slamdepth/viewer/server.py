@@ -53,7 +53,7 @@ def start_server(host: str = HOST, port: int = PORT) -> Any:
         ) from error
     with redirect_stdout(io.StringIO()):  # viser prints an address of its own
         server = viser.ViserServer(host=host, port=port, label="slamdepth", verbose=False)
-    server.gui.configure_theme(show_logo=False, show_share_button=False, control_layout="collapsible")
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server
 
 
