@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
     from slamdepth.mapping.mesh import Mesh
     from slamdepth.mapping.reconstruction import Reconstruction
-    from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage
+    from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage, Watcher
     from slamdepth.pipeline.run import run
-    from slamdepth.tracking import CloudTracker, Tracker, create_tracker
+    from slamdepth.tracking import CloudTracker, MapSnapshot, Tracker, Watched, create_tracker
     from slamdepth.types import (
         Camera,
         DepthKind,
@@ -75,6 +75,7 @@ _HOME = {
     "ImageMatcher": "slamdepth.frontend.features",
     "InputError": "slamdepth.errors",
     "Keyframe": "slamdepth.mapping.keyframe",
+    "MapSnapshot": "slamdepth.tracking",
     "Mesh": "slamdepth.mapping.mesh",
     "OutputError": "slamdepth.errors",
     "PointCloud": "slamdepth.mapping.cloud",
@@ -96,6 +97,8 @@ _HOME = {
     "TrackingStatus": "slamdepth.types",
     "Trajectory": "slamdepth.types",
     "TrajectoryScore": "slamdepth.evaluation",
+    "Watched": "slamdepth.tracking",
+    "Watcher": "slamdepth.pipeline",
     "WeightsError": "slamdepth.errors",
     "WeightsInfo": "slamdepth.types",
     "create_depth_model": "slamdepth.depth.registry",
@@ -129,6 +132,7 @@ __all__ = [
     "ImageMatcher",
     "InputError",
     "Keyframe",
+    "MapSnapshot",
     "Mesh",
     "OutputError",
     "PointCloud",
@@ -150,6 +154,8 @@ __all__ = [
     "TrackingStatus",
     "Trajectory",
     "TrajectoryScore",
+    "Watched",
+    "Watcher",
     "WeightsError",
     "WeightsInfo",
     "__version__",

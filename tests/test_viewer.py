@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Page, browser
-from command_line import ENVIRONMENT, call, command
+from command_line import ENVIRONMENT, call, command, slamdepth
 from scene_data import RED, several_maps_with_scene, write_run
 from test_report_browser import share_of
 from tracking_scene import CAMERA, CONFIG, frames
@@ -247,3 +247,17 @@ def test_a_run_that_goes_on_is_shown(server: Any) -> None:
                 time.sleep(0.02)
         page.wait_for("document.body.innerText.includes('keyframes')")
         assert becomes(lambda: share_of_path(page), 0.0005)
+
+
+def test_a_run_with_a_viewer_gives_the_same_files_and_says_its_address(
+    tiny_room: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("viser", reason="viser is not installed")
+    asked = ("run", tiny_room, "--depth", "sensor", "--max-frames", 12, "--no-mesh", "--output")
+    alone = slamdepth(*asked, tmp_path / "alone")
+    watched = slamdepth(*asked, tmp_path / "watched", "--view", "--port", 0)
+    assert (alone.returncode, watched.returncode) == (0, 0), watched.stderr
+    assert re.search(r"^viewer: http://127\.0\.0\.1:\d+$", watched.stderr, re.MULTILINE)
+    assert "viser" not in watched.stdout + watched.stderr
+    for name in ("trajectory.txt", "trajectory_online.txt", "keyframes.txt"):
+        assert (tmp_path / "alone" / name).read_bytes() == (tmp_path / "watched" / name).read_bytes()

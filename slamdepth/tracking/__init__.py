@@ -6,10 +6,11 @@ from __future__ import annotations
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
 from slamdepth.tracking.cloud_tracker import CloudTracker
+from slamdepth.tracking.snapshot import MapSnapshot, Watched
 from slamdepth.tracking.tracker import Tracker
 from slamdepth.types import Camera
 
-__all__ = ["CloudTracker", "Tracker", "create_tracker"]
+__all__ = ["CloudTracker", "MapSnapshot", "Tracker", "Watched", "create_tracker"]
 
 
 def create_tracker(
