@@ -23,11 +23,8 @@ _AHEAD, _BEHIND, _CASING, _NOW = (96, 128, 176), (74, 158, 255), (12, 14, 18), (
 _DOWN, _BACK_UP = 0.22, 0.14  # shares of the time
 _SWING_RAD = 0.6  # about the scene, while the flight is above it
 _SMOOTH = 0.02  # standard deviation of the smoothing, of the frames
-_BACK, _UP, _FAR = (
-    0.17,
-    0.09,
-    0.35,
-)  # of the size of the scene: behind, above, and looked at ahead of the camera
+# of the size of the scene: behind and above the camera; what is looked at, ahead of and below it
+_BACK, _UP, _FAR, _BELOW = 0.17, 0.09, 0.35, 0.05
 _LEVEL = 0.6  # of a camera's tilt that the flight leaves out
 _SUBPIXELS = 4  # bits
 _NEAR = 0.01  # of the size of the scene
@@ -60,7 +57,7 @@ def plan_flight(one: SceneMap, frames: int) -> Flight:
     ahead -= _LEVEL * (ahead @ up)[:, None] * up
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     near_eyes = places[at] + size * (_UP * up - _BACK * ahead[at])
-    near_targets = places[at] + size * _FAR * ahead[at]
+    near_targets = places[at] + size * (_FAR * ahead[at] - _BELOW * up)
     closeness = _ease(share / _DOWN) * _ease((1 - share) / _BACK_UP)
     swing = _SWING_RAD * (share - 0.5)
     T = np.empty((frames, 4, 4))
