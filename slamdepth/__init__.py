@@ -41,12 +41,12 @@ if TYPE_CHECKING:
     from slamdepth.mapping.mesh import Mesh
     from slamdepth.mapping.reconstruction import Reconstruction
     from slamdepth.mapstore import Map, Session
-    from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage
+    from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage, Watcher
     from slamdepth.pipeline.localize import Localisation, localize
     from slamdepth.pipeline.merge import MergeResult, merge
     from slamdepth.pipeline.resume import resume
     from slamdepth.pipeline.run import run
-    from slamdepth.tracking import CloudTracker, MapLocaliser, Tracker, create_tracker
+    from slamdepth.tracking import CloudTracker, MapLocaliser, MapSnapshot, Tracker, Watched, create_tracker
     from slamdepth.types import (
         Camera,
         DepthKind,
@@ -84,6 +84,7 @@ _HOME = {
     "Map": "slamdepth.mapstore",
     "MapLocaliser": "slamdepth.tracking",
     "MergeResult": "slamdepth.pipeline.merge",
+    "MapSnapshot": "slamdepth.tracking",
     "Mesh": "slamdepth.mapping.mesh",
     "OutputError": "slamdepth.errors",
     "PointCloud": "slamdepth.mapping.cloud",
@@ -108,6 +109,8 @@ _HOME = {
     "TrackingStatus": "slamdepth.types",
     "Trajectory": "slamdepth.types",
     "TrajectoryScore": "slamdepth.evaluation",
+    "Watched": "slamdepth.tracking",
+    "Watcher": "slamdepth.pipeline",
     "WeightsError": "slamdepth.errors",
     "WeightsInfo": "slamdepth.types",
     "create_depth_model": "slamdepth.depth.registry",
@@ -147,6 +150,7 @@ __all__ = [
     "Localisation",
     "Map",
     "MapLocaliser",
+    "MapSnapshot",
     "MergeResult",
     "Mesh",
     "OutputError",
@@ -172,6 +176,8 @@ __all__ = [
     "TrackingStatus",
     "Trajectory",
     "TrajectoryScore",
+    "Watched",
+    "Watcher",
     "WeightsError",
     "WeightsInfo",
     "__version__",

@@ -16,8 +16,8 @@ from slamdepth.cli.console import console, print_places
 from slamdepth.io import read_tum_trajectory
 
 COMMANDS = (
-    "run", "scale", "synth", "evaluate", "evaluate-mesh", "depth", "data-stats", "train-depth", "eval-depth",
-    "weights list", "weights pull",
+    "run", "view", "compare", "render", "scale", "synth", "evaluate", "evaluate-mesh", "depth", "data-stats",
+    "train-depth", "eval-depth", "weights list", "weights pull",
 )  # fmt: skip
 
 
@@ -70,7 +70,7 @@ def test_a_run_says_first_whether_it_can_be_trusted(run_folder: Path, report: di
 def test_a_run_writes_everything_it_promises(run_folder: Path) -> None:
     promised = (
         "trajectory_online.txt trajectory.txt keyframes.txt mesh.ply cloud.ply mesh.png report.json "
-        "report.html config.yaml log.txt README.txt"
+        "report.html scene.safetensors config.yaml log.txt README.txt"
     )
     assert {path.name for path in run_folder.iterdir()} == {*promised.split(), "stdout.txt"}
     online, _ = read_tum_trajectory(run_folder / "trajectory_online.txt")

@@ -25,6 +25,8 @@ HEAVY = (
     "evo",
     "matplotlib",
     "kiss_icp",
+    "trimesh",
+    "viser",
     "scipy",
     "onnx",
     "pydantic",

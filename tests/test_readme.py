@@ -66,7 +66,7 @@ def test_the_run_folder_is_explained() -> None:
     from slamdepth.pipeline.folder import FILES
 
     section = README.split("### Output files")[1].split("###")[0]
-    assert set(re.findall(r"`(\w+\.(?:txt|ply|png|html|json|yaml))`", section)) == set(FILES)
+    assert set(re.findall(r"`(\w+\.(?:txt|ply|png|html|json|yaml|safetensors))`", section)) == set(FILES)
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)

@@ -17,6 +17,7 @@ import typer
 
 from slamdepth.cli import (
     calibrate,
+    compare,
     data_stats,
     depth,
     eval_depth,
@@ -25,10 +26,12 @@ from slamdepth.cli import (
     info,
     localize,
     merge,
+    render,
     run,
     scale,
     synth,
     train,
+    view,
     weights,
 )
 from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_verbose
@@ -49,6 +52,9 @@ app.command("run")(run.run_command)
 app.command("localize")(localize.localize_command)
 app.command("merge")(merge.merge_command)
 app.command("info")(info.info_command)
+app.command("view")(view.view_command)
+app.command("compare")(compare.compare_command)
+app.command("render")(render.render_command)
 app.command("scale")(scale.scale_command)
 app.command("calibrate")(calibrate.calibrate_command)
 app.command("synth")(synth.synth_command)

@@ -61,3 +61,12 @@ SecondsOption = Annotated[
     float | None,
     typer.Option("--seconds", metavar="S", help="Read no more than S seconds of the recording."),
 ]
+PortOption = Annotated[
+    int, typer.Option("--port", metavar="N", help="Port of the viewer's web page; 0 takes a free one.")
+]
+HostOption = Annotated[
+    str,
+    typer.Option(
+        "--host", metavar="ADDRESS", help="Address it listens at; by default only this machine reaches it."
+    ),
+]

@@ -15,6 +15,7 @@ from slamdepth.cli.options import (
     DepthWeightsOption,
     FollowLinksOption,
     MaxFramesOption,
+    PortOption,
     PoseTopicOption,
     SecondsOption,
     StrideOption,
@@ -22,6 +23,7 @@ from slamdepth.cli.options import (
 )
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
+from slamdepth.cli.view import live_view
 
 if TYPE_CHECKING:
     from slamdepth.config import Config
@@ -184,6 +186,11 @@ def run_command(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier run in the output folder.")
     ] = False,
+    view: Annotated[
+        bool,
+        typer.Option("--view", help="Show the map in the browser while it grows; needs the extra 'viewer'."),
+    ] = False,
+    port: PortOption = 8080,
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -240,7 +247,7 @@ def run_command(
     from slamdepth.datasets import ReadOptions
     from slamdepth.pipeline import run
 
-    with stop_on_signals() as stop, JobBar(quiet) as bar:
+    with stop_on_signals() as stop, live_view(port if view else None) as watcher, JobBar(quiet) as bar:
         result = run(
             sequence,
             output,
@@ -256,6 +263,7 @@ def run_command(
             reading=ReadOptions(topic, depth_topic, pose_topic, follow_links, seconds),
             progress=lambda step: _show(bar, step),
             stop=stop,
+            watcher=watcher,
         )
     _print_result(result, quiet)
 

@@ -96,6 +96,11 @@ class LoopCloser:
         self.refused = 0
         self.taken_back = 0
 
+    @property
+    def pairs(self) -> tuple[tuple[int, int], ...]:
+        """The two keyframes of each loop in the pose graph, with those that joined maps."""
+        return tuple((loop.edge.i, loop.edge.j) for loop in self._loops)
+
     def describe(self, features: Any) -> NDArray[np.float32]:
         """The place vector of an image's features; any thread may ask."""
         return self.places.describe(features.place_descriptors)

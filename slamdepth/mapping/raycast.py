@@ -23,7 +23,11 @@ _SAMPLES = 2  # per pixel and axis
 
 
 def render_mesh(
-    mesh: Mesh, camera: Camera, T_world_camera: Floats, background: tuple[int, int, int]
+    mesh: Mesh,
+    camera: Camera,
+    T_world_camera: Floats,
+    background: tuple[int, int, int],
+    samples: int = _SAMPLES,
 ) -> NDArray[np.uint8]:
     """Render ``mesh`` as a pinhole camera sees it: ``(H, W, 3)`` uint8 RGB.
 
@@ -35,6 +39,7 @@ def render_mesh(
         camera: size and intrinsics; distortion is ignored.
         T_world_camera: ``(4, 4)``.
         background: RGB, 0 to 255, where no triangle is hit.
+        samples: rays per pixel and axis.
 
     Raises:
         SlamdepthError: Open3D is not installed.
@@ -51,8 +56,8 @@ def render_mesh(
             o3d.core.Tensor(triangles.astype(np.uint32)),
         )
         nothing, shown = shown, np.zeros_like(shown)
-        for at in np.ndindex(_SAMPLES, _SAMPLES):
-            dy, dx = (np.array(at) + 0.5) / _SAMPLES - 0.5
+        for at in np.ndindex(samples, samples):
+            dy, dx = (np.array(at) + 0.5) / samples - 0.5
             directions = _directions(camera, T_world_camera[:3, :3], float(dx), float(dy))
             origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), directions.shape)
             rays = np.concatenate([origins, directions], axis=-1)
@@ -62,7 +67,7 @@ def render_mesh(
             corners = triangles[hits["primitive_ids"][is_hit]]
             normals, uv = hits["primitive_normals"][is_hit], hits["primitive_uvs"][is_hit]
             sample[is_hit] = _lit(colors, corners, uv, normals, directions[is_hit])
-            shown += sample / np.float32(_SAMPLES**2)
+            shown += sample / np.float32(samples**2)
     return np.asarray(np.round(np.clip(shown, 0.0, 1.0) * 255), np.uint8)
 
 

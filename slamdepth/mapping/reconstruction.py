@@ -32,6 +32,7 @@ class Reconstruction:
         statistics: counts and times of the run.
         others: maps of the same run that never met this one, the largest first. Each has its own world
             frame and its own scale, and its statistics count what is in it.
+        loops: ids of the two keyframes of each loop in the pose graph, both among ``keyframes``.
     """
 
     trajectory: Trajectory
@@ -41,6 +42,7 @@ class Reconstruction:
     notes: tuple[str, ...] = ()
     statistics: RunStatistics = field(default_factory=RunStatistics)
     others: tuple[Reconstruction, ...] = ()
+    loops: tuple[tuple[int, int], ...] = ()
 
     def fuse_mesh(
         self,

@@ -5,5 +5,6 @@ from __future__ import annotations
 
 from slamdepth.pipeline.options import RunInterrupted, RunOptions, RunProgress, RunResult, RunStage
 from slamdepth.pipeline.run import run
+from slamdepth.pipeline.tracking import Watcher
 
-__all__ = ["RunInterrupted", "RunOptions", "RunProgress", "RunResult", "RunStage", "run"]
+__all__ = ["RunInterrupted", "RunOptions", "RunProgress", "RunResult", "RunStage", "Watcher", "run"]

@@ -99,7 +99,7 @@ def finish_others(
     *,
     mesh: bool,
     is_measured: bool,
-) -> tuple[tuple[MapData, ...], tuple[str, ...]]:
+) -> tuple[tuple[MapData, ...], tuple[Mesh | None, ...], tuple[str, ...]]:
     """Mesh and score the maps that never met the largest one.
 
     Args:
@@ -107,11 +107,13 @@ def finish_others(
         is_measured: a sensor measured the depth.
 
     Returns:
-        The maps with mesh and score, and notes.
+        The maps with size of the mesh and score, their meshes, and notes.
     """
     found: list[MapData] = []
+    meshes: list[Mesh | None] = []
     notes: list[str] = []
     for number, one in enumerate(others, start=2):
+        made: Mesh | None = None
         if mesh:
             dense = measure_depth(dataset, one.reconstruction, config, tell)
             made, _, lines = write_mesh(folder, number, dense, config, tell)
@@ -119,8 +121,9 @@ def finish_others(
             notes += lines
         score, lines = judge_trajectory(dataset, one.reconstruction.trajectory, is_measured=is_measured)
         found.append(replace(one, trajectory_score=score))
+        meshes.append(made)
         notes += _of_map(number, lines)
-    return tuple(found), tuple(notes)
+    return tuple(found), tuple(meshes), tuple(notes)
 
 
 def _of_map(number: int, notes: Sequence[str]) -> tuple[str, ...]:

@@ -57,8 +57,9 @@ from slamdepth.pipeline.results import judge_health, judge_trajectory, score_dep
 from slamdepth.pipeline.saved_maps import inherited_scale, start_map_notes, write_maps
 from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.surface import score_mesh
-from slamdepth.pipeline.tracking import AnyTracker, Tracked, track
+from slamdepth.pipeline.tracking import AnyTracker, Tracked, Watcher, track
 from slamdepth.report import MeshCounts, MeshImage, ReportData, render_errors, write_report
+from slamdepth.report.scene import SCENE_FILE, scene_of, write_scene
 from slamdepth.tracking import Tracker
 
 logger = logging.getLogger(__name__)
@@ -81,6 +82,7 @@ def run(
     reading: ReadOptions | None = None,
     progress: ProgressCallback | None = None,
     stop: threading.Event | None = None,
+    watcher: Watcher | None = None,
 ) -> RunResult:
     """Track a sequence, mesh it, score it, and write everything into a run folder.
 
@@ -106,6 +108,7 @@ def run(
         reading: how the sequence is opened, such as the topic of a bag.
         progress: called after each frame and at the start of each stage.
         stop: set it, from any thread or a signal handler, to finish early with the frames tracked so far.
+        watcher: its ``saw(frame, result, tracker)`` is called after each frame, and must return at once.
 
     Returns:
         The folder, the figures of the report, and the reconstruction.
@@ -129,7 +132,7 @@ def run(
         CHECKPOINT_S if checkpoint_s is None else checkpoint_s,
         reading or ReadOptions(),
     )
-    return run_job(options, _settings(config, depth), progress, stop)
+    return run_job(options, _settings(config, depth), progress, stop, watcher=watcher)
 
 
 def run_job(
@@ -138,10 +141,12 @@ def run_job(
     progress: ProgressCallback | None = None,
     stop: threading.Event | None = None,
     begun: Begun | None = None,
+    watcher: Watcher | None = None,
 ) -> RunResult:
     """Do a run from its start, or from where an earlier process left it.
 
     Args:
+        progress, stop, watcher: see :func:`run`.
         begun: what that process left in the run folder ``options.output``.
     """
     tell = progress or (lambda state: None)
@@ -149,7 +154,7 @@ def run_job(
     with run_log() as log:
         job = _prepare(options, config, tell, stopped, begun)
         with job.tracker:
-            tracked = _track(job, log, tell, stopped)
+            tracked = _track(job, log, tell, stopped, watcher)
         result = _finish(job, tracked, tell)
         checkpoint.remove(result.folder)
         return result
@@ -265,7 +270,9 @@ def describe(dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threading.Event) -> Tracked:
+def _track(
+    job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threading.Event, watcher: Watcher | None
+) -> Tracked:
     """Make the run folder and feed the tracker; bad images leave no folder behind."""
     config, dataset, folder = job.config, job.dataset, job.folder
     latest = job.latest
@@ -300,6 +307,7 @@ def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threadin
             stop=stop,
             checkpoints=checkpoints,
             before=None if latest is None else latest.progress,
+            watcher=watcher,
         )
     except SlamdepthError as error:
         # of a full disk, say, what is there is worth keeping, and so is what a killed run left
@@ -356,7 +364,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
         mesh, mesh_images, mesh_notes = write_mesh(folder, 1, reconstruction, config, tell)
         notes += mesh_notes
     is_measured = job.depth_is_measured
-    others, other_notes = finish_others(
+    others, other_meshes, other_notes = finish_others(
         dataset,
         others,
         config,
@@ -393,6 +401,12 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     if (folder / MAP).is_dir():
         files[f"{MAP}/"] = MAP_CONTENT
     tell(RunProgress(RunStage.REPORTING))
+    scene = scene_of(
+        replace(reconstruction, others=tuple(one.reconstruction for one in others)),
+        (mesh, *other_meshes),
+        (trajectory_score, *(one.trajectory_score for one in others)),
+    )
+    write_scene(folder / SCENE_FILE, scene)
     summary = write_report(
         folder.path,
         ReportData(
@@ -412,6 +426,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
             surface_scores=surface_scores,
             others=others,
             mesh_images=mesh_images,
+            scene=scene,
             skipped_frames=tracked.skipped,
             readable_frames=len(dataset),
             promised_frames=getattr(dataset, "frames_promised", len(dataset)),

@@ -20,6 +20,7 @@ from slamdepth.pipeline.checkpoint import Checkpoints, Progress
 from slamdepth.pipeline.options import ProgressCallback, RunInterrupted, RunProgress, RunStage
 from slamdepth.pipeline.prefetch import FramePrefetcher
 from slamdepth.tracking import Tracker
+from slamdepth.tracking.snapshot import Watched
 from slamdepth.types import Frame, StepResult
 
 logger = logging.getLogger(__name__)
@@ -30,7 +31,7 @@ _FEWEST_JUDGED = 40
 _WARNINGS = 5  # images named one by one before only their number is logged
 
 
-class AnyTracker(Protocol):
+class AnyTracker(Watched, Protocol):
     """What the pipeline needs of a tracker."""
 
     def prepare(self, frame: Frame) -> Any: ...
@@ -44,6 +45,13 @@ class AnyTracker(Protocol):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
+
+
+class Watcher(Protocol):
+    """Whoever watches a run, such as a viewer; must return at once."""
+
+    def saw(self, frame: Frame, result: StepResult, tracker: Watched) -> None:
+        """Called after each frame, in the thread of the tracker."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +85,7 @@ def track(
     stop: threading.Event,
     checkpoints: Checkpoints | None = None,
     before: Progress | None = None,
+    watcher: Watcher | None = None,
 ) -> Tracked:
     """Feed the frames to ``tracker`` until the last one or until ``stop`` is set, and finish it.
 
@@ -94,9 +103,7 @@ def track(
     left = indices[len(indices) if before.is_complete else before.done :]
     # what is read ahead of a live source would be late
     capacity = 1 if dataset.is_live else 8
-    reader = FramePrefetcher(
-        dataset, left, with_depth=with_depth, prepare=tracker.prepare, capacity=capacity
-    )
+    reader = FramePrefetcher(dataset, left, with_depth=with_depth, prepare=tracker.prepare, capacity=capacity)
     run = _Run(reader, 0 if len(indices) > _ENDLESS else len(indices), before)
     progress(RunProgress(RunStage.TRACKING, before.done, run.total))
     with reader, TrajectoryWriter(online_path) as writer:
@@ -113,6 +120,8 @@ def track(
             result = tracker.step(item.frame, item.prepared)
             run.steps.append(result)
             online.add(result)
+            if watcher is not None:
+                watcher.saw(item.frame, result, tracker)
             if checkpoints is not None and checkpoints.is_due and isinstance(tracker, Tracker):
                 _checkpoint(tracker, checkpoints, run)
             progress(run.state(result))

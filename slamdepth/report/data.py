@@ -11,6 +11,7 @@ from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.report.mesh_images import MeshImage
 from slamdepth.report.scale import ScaleFacts
+from slamdepth.report.scene.model import Scene
 from slamdepth.types import StepResult, WeightsInfo
 
 
@@ -62,6 +63,7 @@ class ReportData:
         surface_scores: of that mesh against what the sequence's sensor saw; None where it was not scored.
         others: the maps that never met the largest one, the largest first.
         mesh_images: views of the mesh; empty where there is none.
+        scene: what the 3D view of the page shows; None leaves it out.
         skipped_frames: images that could not be read: damaged, or missing.
         readable_frames, promised_frames: of the whole sequence, and as the header of a video says; None where
             that is not known.
@@ -86,6 +88,7 @@ class ReportData:
     surface_scores: AlignedScores | None = None
     others: tuple[MapData, ...] = ()
     mesh_images: tuple[MeshImage, ...] = ()
+    scene: Scene | None = None
     skipped_frames: int = 0
     readable_frames: int | None = None
     promised_frames: int | None = None

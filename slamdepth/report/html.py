@@ -13,6 +13,7 @@ from slamdepth.report.keyframe_images import NEAR_TO_FAR, UNKNOWN, jpeg_address,
 from slamdepth.report.maps import MAP_HEADS, about_maps, map_rows, maps_plot
 from slamdepth.report.page import render
 from slamdepth.report.scale import scale_interval, scale_rows
+from slamdepth.report.scene.page import scene_content
 from slamdepth.report.speed import speed_caption, speed_plot, stage_times
 from slamdepth.report.text import MISSING, count, fixed, percent
 
@@ -20,7 +21,7 @@ _DEPTH_FIGURES = ("abs_rel", "rmse_m", "log_rmse", "delta1", "delta2", "delta3")
 
 
 def build_html(data: ReportData, summary: dict[str, Any]) -> str:
-    """The page of a run as one text: no scripts, nothing loaded from elsewhere.
+    """The page of a run as one text: nothing loaded from elsewhere, no scripts but those of the 3D view.
 
     Args:
         data: what the run made, for plots and images.
@@ -54,6 +55,7 @@ def build_html(data: ReportData, summary: dict[str, Any]) -> str:
         scale_rows=scale_rows(data.scale),
         scale_interval=scale_interval(data.scale),
         files=data.files,
+        **scene_content(data.scene),
         origin_rows=[
             [name.replace("_", " "), MISSING if value is None else str(value)]
             for name, value in {**summary["hardware"], **summary["versions"]}.items()

@@ -120,10 +120,15 @@ def _small(image_rgb: NDArray[np.uint8], *, smooth: bool) -> str:
 
 def jpeg_address(image_rgb: NDArray[np.uint8]) -> str:
     """The image ``(H, W, 3)`` uint8 RGB as a JPEG in a ``data:`` address."""
+    return data_address(encode_jpeg(image_rgb, 84), "image/jpeg")
+
+
+def encode_jpeg(image_rgb: NDArray[np.uint8], quality: int) -> bytes:
+    """The image ``(H, W, 3)`` uint8 RGB as a JPEG file."""
     import cv2
 
-    _, data = cv2.imencode(".jpg", image_rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 84])
-    return data_address(data.tobytes(), "image/jpeg")
+    _, data = cv2.imencode(".jpg", image_rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return data.tobytes()
 
 
 def rgb_of(colour: str) -> tuple[int, int, int]:

@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 
 def render(template: str, **content: object) -> str:
     """The page of ``template`` with ``content``, as one self-contained HTML text."""
-    return _environment().get_template(template).render(version=__version__, **content)
+    return (
+        _environment()
+        .get_template(template)
+        .render(**{"version": __version__, "script_hashes": "", **content})
+    )
 
 
 def data_address(data: bytes, mime_type: str) -> str:

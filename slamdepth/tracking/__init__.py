@@ -13,6 +13,9 @@ from slamdepth.tracking.tracker import Tracker
 from slamdepth.types import Camera
 
 __all__ = ["CloudTracker", "MapLocaliser", "Tracker", "create_tracker"]
+from slamdepth.tracking.snapshot import MapSnapshot, Watched
+
+__all__ = ["CloudTracker", "MapSnapshot", "Tracker", "Watched", "create_tracker"]
 
 
 def create_tracker(

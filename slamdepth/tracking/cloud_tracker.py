@@ -22,6 +22,7 @@ from slamdepth.mapping.keyframe_store import KeyframeStore, StoredFrame, StoredP
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.thread_limits import single_threaded
 from slamdepth.tracking.frame_log import check_frame
+from slamdepth.tracking.snapshot import MapSnapshot
 from slamdepth.types import (
     Camera,
     Frame,
@@ -112,6 +113,21 @@ class CloudTracker:
             self._keyframes.append(_Kept(StoredFrame(frame), StoredPrediction(prediction), T_world_camera))
             self._store.tidy(self._keyframes)
         return self._result(frame, T_world_camera, len(cloud), is_keyframe, timings)
+
+    def ask_for_snapshot(self) -> None:
+        """Nothing is to be copied: see :meth:`take_snapshot`."""
+
+    def take_snapshot(self) -> MapSnapshot | None:
+        """The keyframes so far, which never move, and the points of the last clouds."""
+        if not self._keyframes:
+            return None
+        return MapSnapshot(
+            0,
+            np.array([kept.frame.timestamp_s for kept in self._keyframes]),
+            np.stack([kept.T_world_camera for kept in self._keyframes]),
+            np.array(self._odometry.local_map_w),
+            np.zeros((0, 2), np.int64),
+        )
 
     def _overlap(self, cloud_c: Floats, T_world_camera: Floats) -> float:
         """Share of the cloud that the last keyframe has in its view."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -112,14 +113,26 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
     kept_s = set(trajectory.timestamps_s.tolist())
     withdrawn = frames.withdrawn + len(found) - len(trajectory)
     statistics = replace(statistics, tracked=len(trajectory), withdrawn=withdrawn)
+    kept = tuple(one for one in keyframes if one.frame.timestamp_s in kept_s)
     return Reconstruction(
         trajectory=trajectory,
-        keyframes=tuple(one for one in keyframes if one.frame.timestamp_s in kept_s),
+        keyframes=kept,
         points_m=points_m,
         gravity_w=integration.gravity.in_world(),
         notes=final.notes,
         statistics=statistics,
+        loops=_loops(integration, in_time, kept),
     )
+
+
+def _loops(
+    integration: KeyframeIntegration, in_time: Sequence[MapKeyframe], kept: Sequence[Keyframe]
+) -> tuple[tuple[int, int], ...]:
+    """The loops between the keyframes that are ``kept``, which are numbered in order of time."""
+    number = {keyframe.id: n for n, keyframe in enumerate(in_time)}
+    ids = {keyframe.id for keyframe in kept}
+    pairs = ((number[i], number[j]) for i, j in integration.loops.pairs if i in number and j in number)
+    return tuple(sorted({(min(pair), max(pair)) for pair in pairs if ids.issuperset(pair)}))
 
 
 def optimise_map(tracked: MapTracker, config: Config) -> FinalMap:

@@ -30,6 +30,7 @@ from slamdepth.tracking.frame_log import check_frame
 from slamdepth.tracking.map_parts import RunParts, StoredKeyframes
 from slamdepth.tracking.map_tracker import MapTracker, Placed
 from slamdepth.tracking.saved_maps import MapInfo, load_map, save_map
+from slamdepth.tracking.snapshot import MapSnapshot, snapshot_of
 from slamdepth.tracking.status import STATUS
 from slamdepth.tracking.wide_features import WideFeatures
 from slamdepth.tracking.workers import DepthWorker, Workers
@@ -82,6 +83,8 @@ class Tracker:
         self._last_time_s = -np.inf
         self._finished = False
         self._is_complete = False
+        self._is_watched = False
+        self._snapshot: MapSnapshot | None = None
         _load_libraries()
 
     def _new_map(self, id_: int) -> MapTracker:
@@ -171,6 +174,8 @@ class Tracker:
             self._workers.between.wait()
             placed = self._atlas.track(frame, raw)
             result = self._result(frame, placed)
+            if self._is_watched and self._active.map.keyframes:
+                self._snapshot, self._is_watched = snapshot_of(self._active), False
         self._last_time_s = self._active.motion.last_time_s = frame.timestamp_s
         self._watch.next_frame()
         if self._active.map.keyframes:
@@ -178,6 +183,15 @@ class Tracker:
             if self._active.integration.is_due:
                 self._workers.between.begin(self._atlas.run_stage)
         return result
+
+    def ask_for_snapshot(self) -> None:
+        """Let the next :meth:`step` copy the map, for :meth:`take_snapshot`; it changes nothing else."""
+        self._is_watched = True
+
+    def take_snapshot(self) -> MapSnapshot | None:
+        """The copy that was asked for, once; None where there is none yet."""
+        taken, self._snapshot = self._snapshot, None
+        return taken
 
     def _features(self, frame: Frame, prepared: Prepared | None) -> Features:
         prepared = prepared or self._prepare(frame)
