@@ -21,6 +21,7 @@ from slamdepth.cli import (
     eval_depth,
     evaluate,
     evaluate_mesh,
+    export,
     run,
     scale,
     synth,
@@ -42,6 +43,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("run")(run.run_command)
+app.command("export")(export.export_command)
 app.command("scale")(scale.scale_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)

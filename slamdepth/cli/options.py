@@ -37,3 +37,8 @@ MaxFramesOption = Annotated[
 DeviceOption = Annotated[
     str, typer.Option("--device", metavar="cpu|cuda|cuda:N", help="Where the network runs.")
 ]
+
+
+def export_names(text: str | None) -> tuple[str, ...]:
+    """The formats named in ``--export colmap,glb``."""
+    return tuple(dict.fromkeys(name.strip() for name in (text or "").split(",") if name.strip()))

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, print_notes, print_places
-from slamdepth.cli.options import CameraOption, DepthWeightsOption, MaxFramesOption, StrideOption
+from slamdepth.cli.options import (
+    CameraOption,
+    DepthWeightsOption,
+    MaxFramesOption,
+    StrideOption,
+    export_names,
+)
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
 
@@ -23,6 +29,7 @@ _PLACES = {
     "other maps": "maps",
     "mesh file": "mesh.ply",
     "report": "report.html",
+    "exports": "export",
 }
 
 
@@ -131,6 +138,13 @@ def run_command(
     voxel_size: Annotated[
         float | None, typer.Option(metavar="M", help="Edge of the mesh's voxels in metres. Default: 0.02")
     ] = None,
+    export: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME[,NAME]",
+            help="Also export the result to colmap, nerfstudio, ...; see 'slamdepth export --help'.",
+        ),
+    ] = None,
     device: Annotated[
         str | None, typer.Option(metavar="cpu|cuda", help="Where the network runs. Default: cpu")
     ] = None,
@@ -191,6 +205,7 @@ def run_command(
             stride=stride,
             mesh=not no_mesh,
             overwrite=overwrite,
+            export=export_names(export),
             progress=lambda step: _show(bar, step),
             stop=stop,
         )

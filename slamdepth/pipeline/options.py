@@ -26,6 +26,7 @@ class RunOptions:
         stride: take every Nth frame.
         mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
+        exports: formats that the result is exported to, see :func:`slamdepth.export_run`.
 
     Raises:
         ConfigError: ``stride`` or ``max_frames`` is below 1.
@@ -38,6 +39,7 @@ class RunOptions:
     stride: int = 1
     mesh: bool = True
     overwrite: bool = False
+    exports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_frames_asked(self.stride, self.max_frames)
@@ -72,6 +74,7 @@ class RunStage(str, Enum):
     DRAWING = "drawing the mesh"
     SCORING = "scoring"
     COMPARING = "scoring the mesh"
+    EXPORTING = "exporting"
     REPORTING = "writing the report"
 
 
@@ -82,7 +85,7 @@ class RunProgress:
     Attributes:
         stage: what the run is doing.
         done, total: frames while tracking, fitting, looking for markers and scoring the mesh, keyframes
-            while meshing, steps of the work while measuring depth.
+            while meshing, images while exporting, steps of the work while measuring depth.
         fps: frames per second so far.
         status: of the last frame, None before the first.
         keyframes, loop_closures: totals so far.

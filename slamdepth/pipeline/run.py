@@ -7,6 +7,7 @@ import logging
 import random
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from logging.handlers import MemoryHandler
 from pathlib import Path
@@ -24,7 +25,17 @@ from slamdepth.frontend.features import feature_weights
 from slamdepth.io import write_text
 from slamdepth.mapping.mesh import Mesh
 from slamdepth.pipeline.dense import measure_depth
-from slamdepth.pipeline.folder import FILES, MAPS, MAPS_CONTENT, RunFolder, run_log, write_log_to
+from slamdepth.pipeline.export import check_exports, export_results
+from slamdepth.pipeline.folder import (
+    EXPORTS,
+    EXPORTS_CONTENT,
+    FILES,
+    MAPS,
+    MAPS_CONTENT,
+    RunFolder,
+    run_log,
+    write_log_to,
+)
 from slamdepth.pipeline.maps import finish_others, settle_others, write_mesh, write_trajectories
 from slamdepth.pipeline.options import (
     ProgressCallback,
@@ -58,6 +69,7 @@ def run(
     stride: int = 1,
     mesh: bool = True,
     overwrite: bool = False,
+    export: Sequence[str] = (),
     progress: ProgressCallback | None = None,
     stop: threading.Event | None = None,
 ) -> RunResult:
@@ -77,6 +89,7 @@ def run(
         stride: take every Nth frame.
         mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
+        export: formats to export the result to, into ``export/`` of the run folder; see :func:`export_run`.
         progress: called after each frame and at the start of each stage.
         stop: set it, from any thread or a signal handler, to finish early with the frames tracked so far.
 
@@ -97,6 +110,7 @@ def run(
         stride,
         mesh,
         overwrite,
+        tuple(export),
     )
     settings = _settings(config, depth)
     tell = progress or (lambda state: None)
@@ -144,6 +158,7 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     """Open and check everything that a run needs, what costs least first."""
     from slamdepth.tracking import create_tracker
 
+    check_exports(options.exports)
     config = with_chosen_model(config)
     dataset = open_dataset(options.sequence, options.camera_file)
     indices = options.indices(len(dataset))
@@ -234,6 +249,15 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     )
     notes += other_notes
 
+    notes += export_results(
+        folder,
+        dataset,
+        (reconstruction, *(one.reconstruction for one in others)),
+        (scale_facts.sentence, *(one.scale.sentence for one in others)),
+        job.options.exports,
+        tell,
+    )
+
     tell(RunProgress(RunStage.SCORING))
     trajectory_score, score_notes = judge_trajectory(
         dataset, reconstruction.trajectory, is_measured=is_measured
@@ -257,6 +281,8 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     )
     absent = {name for name, is_there in optional if not is_there}
     files = {name: what for name, what in FILES.items() if name not in absent}
+    files |= {MAPS: MAPS_CONTENT} if others else {}
+    files |= {EXPORTS: EXPORTS_CONTENT} if (folder / EXPORTS).is_dir() else {}
     tell(RunProgress(RunStage.REPORTING))
     summary = write_report(
         folder.path,
@@ -282,7 +308,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
             promised_frames=getattr(dataset, "frames_promised", len(dataset)),
             notes=(*notes, *score_notes, *depth_notes, *surface_notes),
             options=_reported_options(job.options, tracked),
-            files={**files, MAPS: MAPS_CONTENT} if others else files,
+            files=files,
         ),
     )
     logger.info("done: %s", folder.path)
@@ -322,6 +348,8 @@ def _arguments(options: RunOptions) -> list[str]:
         arguments += ["--max-frames", str(options.max_frames)]
     if options.stride != 1:
         arguments += ["--stride", str(options.stride)]
+    if options.exports:
+        arguments += ["--export", ",".join(options.exports)]
     return arguments if options.mesh else [*arguments, "--no-mesh"]
 
 

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which keypoints of which views see a point, and how well they fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamdepth.errors import InputError
+from slamdepth.export.images import ExportImages
+from slamdepth.export.scene import ExportScene
+from slamdepth.typing import Bytes, Floats, Ints
+
+MAX_ERROR_PX = 4.0
+"""Farther observations are left out, as COLMAP's mapper does (``filter_max_reproj_error``)."""
+_GREY = 128
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Points with the keypoints that see them; each is seen by two views at least.
+
+    Attributes:
+        points_m: ``(P, 3)`` world frame.
+        error_px: ``(P,)`` mean reprojection error of each point.
+        keypoints_px: of each view, ``(N, 2)`` pixels of the exported image.
+        rows: of each view, ``(N,)`` row of the point that each keypoint sees, -1 for none.
+        mean_error_px: over all observations.
+        dropped: observations that were left out.
+    """
+
+    points_m: Floats
+    error_px: Floats
+    keypoints_px: tuple[Floats, ...]
+    rows: tuple[Ints, ...]
+    mean_error_px: float
+    dropped: int
+
+    @property
+    def observations(self) -> int:
+        """Number of keypoints that see a point."""
+        return sum(int(np.count_nonzero(rows >= 0)) for rows in self.rows)
+
+
+def build_tracks(scene: ExportScene, images: ExportImages) -> Tracks:
+    """Project every landmark into the views that see it, and keep what fits.
+
+    Raises:
+        InputError: the run kept no landmarks, or none of them is seen twice.
+    """
+    if not scene.has_tracks:
+        raise InputError(
+            "this run kept no landmarks to export: run it again with 'slamdepth run ... --export colmap'"
+        )
+    keypoints: list[Floats] = []
+    kept: list[Ints] = []
+    errors: list[Floats] = []
+    offered = 0
+    for view in scene.views:
+        px, shown = images.keypoints(view)
+        rows = np.where(shown, view.point_rows, -1)
+        at = np.flatnonzero(rows >= 0)
+        projected, ahead = images.project(view, scene.points_m[rows[at]])
+        error = np.linalg.norm(projected - px[at], axis=1)
+        offered += int(np.count_nonzero(view.point_rows >= 0))
+        rows[at[~(ahead & (error <= MAX_ERROR_PX))]] = -1
+        full = np.zeros(len(px))
+        full[at] = error
+        keypoints.append(px[shown])
+        kept.append(_once(rows[shown], full[shown]))
+        errors.append(full[shown])
+    views_of = np.zeros(len(scene.points_m), np.int64)
+    for rows in kept:
+        views_of[rows[rows >= 0]] += 1
+    return _numbered(scene.points_m, keypoints, kept, errors, views_of, offered)
+
+
+def _once(rows: Ints, error: Floats) -> Ints:
+    """Of keypoints of one image that see the same point, only the closest is left."""
+    order = np.argsort(error, kind="stable")
+    first = order[np.unique(rows[order], return_index=True)[1]]
+    keeps = np.zeros(len(rows), np.bool_)
+    keeps[first] = True
+    return np.where(keeps, rows, -1)
+
+
+def _numbered(
+    points_m: Floats,
+    keypoints: list[Floats],
+    kept: list[Ints],
+    errors: list[Floats],
+    views_of: Ints,
+    offered: int,
+) -> Tracks:
+    used = np.flatnonzero(views_of >= 2)
+    if len(used) == 0:
+        raise InputError("no landmark of this run is seen by two views: there is nothing to export")
+    number = np.full(len(points_m) + 1, -1)  # the last is that of no point
+    number[used] = np.arange(len(used))
+    rows = tuple(number[one] for one in kept)
+    sums, count = np.zeros(len(used)), np.zeros(len(used))
+    for row, error in zip(rows, errors, strict=True):
+        at = row >= 0
+        np.add.at(sums, row[at], error[at])
+        np.add.at(count, row[at], 1.0)
+    return Tracks(
+        points_m[used],
+        sums / count,
+        tuple(keypoints),
+        rows,
+        float(sums.sum() / count.sum()),
+        offered - int(count.sum()),
+    )
+
+
+class Colours:
+    """Colours of points, averaged over the views that see them; grey where no image was added."""
+
+    def __init__(self, tracks: Tracks) -> None:
+        self._tracks = tracks
+        self._sums = np.zeros((len(tracks.points_m), 3))
+        self._count = np.zeros(len(tracks.points_m))
+
+    def add(self, number: int, image_rgb: Bytes) -> None:
+        """Take the colours of the ``number``-th view from its exported image."""
+        rows = self._tracks.rows[number]
+        at = rows >= 0
+        x, y = np.rint(self._tracks.keypoints_px[number][at]).astype(np.int64).T
+        height, width = image_rgb.shape[:2]
+        seen = image_rgb[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+        np.add.at(self._sums, rows[at], seen.astype(np.float64))
+        np.add.at(self._count, rows[at], 1.0)
+
+    def rgb(self) -> Bytes:
+        """``(P, 3)`` uint8."""
+        mean = self._sums / np.maximum(self._count, 1.0)[:, None]
+        return np.where(self._count[:, None] > 0, np.rint(mean), _GREY).astype(np.uint8)
