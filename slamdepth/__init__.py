@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from slamdepth.mapping.mesh import Mesh
     from slamdepth.mapping.reconstruction import Reconstruction
     from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage
+    from slamdepth.pipeline.export import export_run
     from slamdepth.pipeline.run import run
     from slamdepth.tracking import CloudTracker, Tracker, create_tracker
     from slamdepth.types import (
@@ -101,6 +102,7 @@ _HOME = {
     "create_depth_model": "slamdepth.depth.registry",
     "create_tracker": "slamdepth.tracking",
     "densify": "slamdepth.dense",
+    "export_run": "slamdepth.pipeline.export",
     "open_dataset": "slamdepth.datasets",
     "read_tum_trajectory": "slamdepth.io",
     "run": "slamdepth.pipeline.run",
@@ -156,6 +158,7 @@ __all__ = [
     "create_depth_model",
     "create_tracker",
     "densify",
+    "export_run",
     "open_dataset",
     "read_tum_trajectory",
     "run",
