@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,12 +48,8 @@ def build_tracks(scene: ExportScene, images: ExportImages) -> Tracks:
     """Project every landmark into the views that see it, and keep what fits.
 
     Raises:
-        InputError: the run kept no landmarks, or none of them is seen twice.
+        InputError: no landmark is seen twice.
     """
-    if not scene.has_tracks:
-        raise InputError(
-            "this run kept no landmarks to export: run it again with 'slamdepth run ... --export colmap'"
-        )
     keypoints: list[Floats] = []
     kept: list[Ints] = []
     errors: list[Floats] = []
@@ -70,10 +67,7 @@ def build_tracks(scene: ExportScene, images: ExportImages) -> Tracks:
         keypoints.append(px[shown])
         kept.append(_once(rows[shown], full[shown]))
         errors.append(full[shown])
-    views_of = np.zeros(len(scene.points_m), np.int64)
-    for rows in kept:
-        views_of[rows[rows >= 0]] += 1
-    return _numbered(scene.points_m, keypoints, kept, errors, views_of, offered)
+    return numbered(scene.points_m, keypoints, kept, errors, offered)[0]
 
 
 def _once(rows: Ints, error: Floats) -> Ints:
@@ -85,33 +79,45 @@ def _once(rows: Ints, error: Floats) -> Ints:
     return np.where(keeps, rows, -1)
 
 
-def _numbered(
+def numbered(
     points_m: Floats,
-    keypoints: list[Floats],
-    kept: list[Ints],
-    errors: list[Floats],
-    views_of: Ints,
+    keypoints_px: Sequence[Floats],
+    rows: Sequence[Ints],
+    error_px: Sequence[Floats],
     offered: int,
-) -> Tracks:
-    used = np.flatnonzero(views_of >= 2)
+) -> tuple[Tracks, Ints]:
+    """The tracks of the points that two views see or more, numbered anew.
+
+    Args:
+        points_m: ``(P, 3)``.
+        keypoints_px, rows, error_px: of each view, see :class:`Tracks`.
+        offered: observations that there were.
+
+    Returns:
+        The tracks, and ``(Q,)`` which of the points each of theirs was.
+
+    Raises:
+        InputError: there is no such point.
+    """
+    views_of = np.zeros(len(points_m), np.int64)
+    for one in rows:
+        views_of[one[one >= 0]] += 1
+    used: Ints = np.flatnonzero(views_of >= 2)
     if len(used) == 0:
         raise InputError("no landmark of this run is seen by two views: there is nothing to export")
     number = np.full(len(points_m) + 1, -1)  # the last is that of no point
     number[used] = np.arange(len(used))
-    rows = tuple(number[one] for one in kept)
+    found = tuple(number[one] for one in rows)
     sums, count = np.zeros(len(used)), np.zeros(len(used))
-    for row, error in zip(rows, errors, strict=True):
+    for row, error in zip(found, error_px, strict=True):
         at = row >= 0
         np.add.at(sums, row[at], error[at])
         np.add.at(count, row[at], 1.0)
-    return Tracks(
-        points_m[used],
-        sums / count,
-        tuple(keypoints),
-        rows,
-        float(sums.sum() / count.sum()),
-        offered - int(count.sum()),
+    dropped = offered - int(count.sum())
+    tracks = Tracks(
+        points_m[used], sums / count, tuple(keypoints_px), found, float(sums.sum() / count.sum()), dropped
     )
+    return tracks, used
 
 
 class Colours:

@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
+from slamdepth.errors import InputError
 from slamdepth.export.images import ImageMode
 from slamdepth.export.registry import ExportFormat, ExportRequest, register_format
 from slamdepth.export.scene import ExportScene
-from slamdepth.export.tracks import Colours, Tracks, build_tracks
-from slamdepth.export.view_files import image_name, write_images
+from slamdepth.export.tracks import Tracks
+from slamdepth.export.view_files import image_name, write_views
 from slamdepth.geometry import invert, rotation_to_quat_xyzw
 from slamdepth.types import Camera
 from slamdepth.typing import Bytes
@@ -37,21 +38,24 @@ class ColmapFormat(ExportFormat):
 
     def write(self, request: ExportRequest, folder: Path) -> tuple[str, ...]:
         scene, images = request.scene, request.images()
-        tracks = build_tracks(scene, images)
-        colours = Colours(tracks)
-        missing = write_images(request, images, folder, colours)
+        written = write_views(request, images, folder)
+        tracks = written.tracks
+        if tracks is None:
+            raise InputError(
+                "this run kept no landmarks to export: run it again with 'slamdepth run ... --export colmap'"
+            )
         model = folder / "sparse" / "0"
         model.mkdir(parents=True)
         (model / "cameras.bin").write_bytes(_cameras(images.camera))
         (model / "images.bin").write_bytes(_images(scene, tracks))
-        (model / "points3D.bin").write_bytes(_points(tracks, colours.rgb()))
+        (model / "points3D.bin").write_bytes(_points(tracks, written.colors))
         lines = [
             f"{len(scene.views)} images, {len(tracks.points_m)} points, {tracks.observations} observations; "
             f"mean reprojection error {tracks.mean_error_px:.3f} px.",
             f"{tracks.dropped} observations are left out: more than 4 px off, or not in the image.",
         ]
-        if missing:
-            lines.append(f"{len(missing)} images do not decode and are missing.")
+        if written.missing:
+            lines.append(f"{len(written.missing)} images do not decode and are missing.")
         if request.mode is not ImageMode.NONE:
             lines.append("Open it with: colmap gui --import_path sparse/0 --image_path images")
         return tuple(lines)

@@ -17,9 +17,8 @@ import numpy as np
 from slamdepth.export.images import ExportImages, ImageMode
 from slamdepth.export.points import start_points
 from slamdepth.export.registry import ExportFormat, ExportRequest, register_format
-from slamdepth.export.tracks import Colours, build_tracks
 from slamdepth.export.upright import z_up
-from slamdepth.export.view_files import FOLDER, image_name, write_images
+from slamdepth.export.view_files import FOLDER, image_name, write_views
 from slamdepth.geometry import transform
 from slamdepth.io import write_json, write_point_cloud
 from slamdepth.typing import Bytes, Floats
@@ -38,13 +37,9 @@ class NerfstudioFormat(ExportFormat):
 
     def write(self, request: ExportRequest, folder: Path) -> tuple[str, ...]:
         scene, images = request.scene, request.images()
-        tracks = build_tracks(scene, images) if scene.has_tracks else None
-        colours = None if tracks is None else Colours(tracks)
-        missing = set(write_images(request, images, folder, colours))
-        points_m, colors = start_points(
-            scene, (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-            if tracks is None or colours is None else (tracks.points_m, colours.rgb()),
-        )  # fmt: skip
+        written = write_views(request, images, folder)
+        landmarks = np.zeros((0, 3)) if written.tracks is None else written.tracks.points_m
+        points_m, colors = start_points(scene, (landmarks, written.colors))
         T_file_world = z_up(scene)
         frames = [
             {
@@ -53,7 +48,7 @@ class NerfstudioFormat(ExportFormat):
                 "timestamp_s": view.timestamp_s,
             }
             for number, view in enumerate(scene.views)
-            if number not in missing
+            if number not in written.missing
         ]
         document = {**_intrinsics(images), **_frame(T_file_world, scene.gravity_w is not None)}
         lines = [
