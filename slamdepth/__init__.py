@@ -39,10 +39,12 @@ if TYPE_CHECKING:
     from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
     from slamdepth.mapping.mesh import Mesh
     from slamdepth.mapping.reconstruction import Reconstruction
+    from slamdepth.mapstore import Map, Session
     from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage
     from slamdepth.pipeline.export import export_run
+    from slamdepth.pipeline.localize import Localisation, localize
     from slamdepth.pipeline.run import run
-    from slamdepth.tracking import CloudTracker, Tracker, create_tracker
+    from slamdepth.tracking import CloudTracker, MapLocaliser, Tracker, create_tracker
     from slamdepth.types import (
         Camera,
         DepthKind,
@@ -76,6 +78,9 @@ _HOME = {
     "ImageMatcher": "slamdepth.frontend.features",
     "InputError": "slamdepth.errors",
     "Keyframe": "slamdepth.mapping.keyframe",
+    "Localisation": "slamdepth.pipeline.localize",
+    "Map": "slamdepth.mapstore",
+    "MapLocaliser": "slamdepth.tracking",
     "Mesh": "slamdepth.mapping.mesh",
     "OutputError": "slamdepth.errors",
     "PointCloud": "slamdepth.mapping.cloud",
@@ -87,6 +92,7 @@ _HOME = {
     "RunResult": "slamdepth.pipeline",
     "RunStage": "slamdepth.pipeline",
     "RunStatistics": "slamdepth.types",
+    "Session": "slamdepth.mapstore",
     "SlamdepthError": "slamdepth.errors",
     "StepResult": "slamdepth.types",
     "StoredDenseDepth": "slamdepth.mapping.dense_depth",
@@ -103,6 +109,7 @@ _HOME = {
     "create_tracker": "slamdepth.tracking",
     "densify": "slamdepth.dense",
     "export_run": "slamdepth.pipeline.export",
+    "localize": "slamdepth.pipeline.localize",
     "open_dataset": "slamdepth.datasets",
     "read_tum_trajectory": "slamdepth.io",
     "run": "slamdepth.pipeline.run",
@@ -131,6 +138,9 @@ __all__ = [
     "ImageMatcher",
     "InputError",
     "Keyframe",
+    "Localisation",
+    "Map",
+    "MapLocaliser",
     "Mesh",
     "OutputError",
     "PointCloud",
@@ -142,6 +152,7 @@ __all__ = [
     "RunResult",
     "RunStage",
     "RunStatistics",
+    "Session",
     "SlamdepthError",
     "StepResult",
     "StoredDenseDepth",
@@ -159,6 +170,7 @@ __all__ = [
     "create_tracker",
     "densify",
     "export_run",
+    "localize",
     "open_dataset",
     "read_tum_trajectory",
     "run",

@@ -40,6 +40,15 @@ class Stopwatch:
         """Mean over all calls of each stage."""
         return {stage: total / self._times[stage] for stage, total in self._total_ms.items()}
 
+    def state(self) -> dict[str, list[float]]:
+        """Total milliseconds and number of calls of each stage."""
+        return {stage: [total, self._times[stage]] for stage, total in self._total_ms.items()}
+
+    def restore(self, state: dict[str, list[float]]) -> None:
+        """Go on from what :meth:`state` gave."""
+        for stage, (total, times) in state.items():
+            self._total_ms[stage], self._times[stage] = total, int(times)
+
     def calls(self) -> dict[str, int]:
         """Number of calls of each stage."""
         return dict(self._times)

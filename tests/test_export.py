@@ -172,6 +172,25 @@ def test_every_frame_can_be_exported(result: RunResult, tmp_path: Path) -> None:
     assert not (folder / "images").exists()
 
 
+def test_the_saved_map_exports_as_the_run_did(result: RunResult, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    folder = package.export_run(result.folder, "colmap", tmp_path / "out")
+    later, then = (
+        pycolmap.Reconstruction(place / "sparse" / "0")
+        for place in (folder, result.folder / "export" / "colmap")
+    )
+    assert later.num_points3D() == then.num_points3D()
+    assert later.compute_mean_reprojection_error() == pytest.approx(
+        then.compute_mean_reprojection_error(), rel=1e-3
+    )
+    for number, image in then.images.items():
+        np.testing.assert_allclose(
+            later.images[number].cam_from_world().matrix(), image.cam_from_world().matrix(), atol=1e-9
+        )
+    text = (folder / "README.txt").read_text()
+    assert text == (result.folder / "export" / "colmap" / "README.txt").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -326,3 +345,21 @@ def test_nanoseconds_are_those_of_the_decimal() -> None:
     for text in ("1305031453.374112", "0.1", "1403636579.763555527"):
         assert nanoseconds(float(text)) == int((Decimal(repr(float(text))) * 10**9).to_integral_value())
     assert nanoseconds(1305031453.374112) == 1305031453374112000
+
+
+@pytest.mark.data
+@pytest.mark.weights
+@pytest.mark.parametrize("name", ["rgbd_dataset_freiburg1_desk", "7scenes_redkitchen_seq-01"])
+def test_real_sequences_are_reprojected_within_a_pixel(data_dir: Path, tmp_path: Path, name: str) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    try:
+        run = package.run(
+            data_dir / name, tmp_path / "run", depth="dinov2", max_frames=60, mesh=False, export=("colmap",)
+        )
+    except package.WeightsError as error:
+        pytest.skip(f"the backbone is not in the cache: {error}")
+    model = pycolmap.Reconstruction(run.folder / "export" / "colmap" / "sparse" / "0")
+    assert model.compute_mean_reprojection_error() < 1.0
+    assert model.num_points3D() > 500
+    assert model.num_reg_images() == len(run.reconstruction.keyframes)
+    assert min(point.track.length() for point in model.points3D.values()) >= 2

@@ -22,6 +22,7 @@ from slamdepth.cli import (
     evaluate,
     evaluate_mesh,
     export,
+    localize,
     run,
     scale,
     synth,
@@ -44,6 +45,7 @@ app = typer.Typer(
 )
 app.command("run")(run.run_command)
 app.command("export")(export.export_command)
+app.command("localize")(localize.localize_command)
 app.command("scale")(scale.scale_command)
 app.command("synth")(synth.synth_command)
 app.command("evaluate")(evaluate.evaluate_command)

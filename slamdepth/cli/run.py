@@ -28,6 +28,7 @@ _PLACES = {
     "trajectory": "trajectory.txt",
     "other maps": "maps",
     "mesh file": "mesh.ply",
+    "map": "map",
     "report": "report.html",
     "exports": "export",
 }
@@ -151,6 +152,17 @@ def run_command(
     seed: Annotated[
         int | None, typer.Option(metavar="N", help="Seed of everything random. Default: 0")
     ] = None,
+    start_map: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            metavar="RUN",
+            help="Go on from the map of an earlier run, and extend it.",
+        ),
+    ] = None,
+    map_images: Annotated[
+        bool, typer.Option("--map-images", help="Keep the keyframes' images in the run's map.")
+    ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier run in the output folder.")
     ] = False,
@@ -206,6 +218,8 @@ def run_command(
             mesh=not no_mesh,
             overwrite=overwrite,
             export=export_names(export),
+            start_map=start_map,
+            map_images=map_images,
             progress=lambda step: _show(bar, step),
             stop=stop,
         )

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from slamdepth.typing import Floats
@@ -52,6 +54,20 @@ class GravityConsensus:
         """
         self._estimates_w.append(R_world_camera @ gravity)
         self._confidences.append(confidence)
+
+    def state(self) -> dict[str, Any]:
+        """All estimates as plain values, for a saved map or a checkpoint."""
+        return {
+            "gravity_w": np.array(self._estimates_w, dtype=np.float64).reshape(-1, 3),
+            "confidence": np.array(self._confidences, dtype=np.float64),
+            "queries": self._queries,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Remember what :meth:`state` gave, and nothing else."""
+        self._estimates_w = [np.array(estimate) for estimate in state["gravity_w"]]
+        self._confidences = state["confidence"].tolist()
+        self._queries = state["queries"]
 
     def turn(self, R_new_old: Floats) -> None:
         """Follow a world that was turned by ``(3, 3)``."""

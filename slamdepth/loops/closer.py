@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -14,8 +14,17 @@ from numpy.typing import NDArray
 from slamdepth.backend.pose_graph import Edge, PoseGraphResult, optimise_pose_graph
 from slamdepth.config import Config
 from slamdepth.geometry import Similarity, invert, rotation_angle_rad
+from slamdepth.io.tree import Tree
 from slamdepth.loops.consistency import Drift, RefusedLoops
-from slamdepth.loops.edges import MeasuredLoop, odometry_edges, weakness
+from slamdepth.loops.edges import (
+    MeasuredLoop,
+    edge_arrays,
+    edges_of,
+    loop_arrays,
+    loops_of,
+    odometry_edges,
+    weakness,
+)
 from slamdepth.loops.look_alikes import (
     ALREADY_LINKED,
     FEWEST_DEPTHS,
@@ -156,6 +165,44 @@ class LoopCloser:
         for meeting in meetings:
             self._loops.append(MeasuredLoop.of(meeting.edge(_LOOP_SIGMAS), units))
             self._map.fuse_view(meeting.keyframe, meeting.landmark_ids)
+
+    @property
+    def measured(self) -> list[MeasuredLoop]:
+        """The loops that were closed, as they were measured."""
+        return list(self._loops)
+
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint."""
+        return {
+            "places": self.places.state(),
+            "loops": loop_arrays(self._loops),
+            "refused_edges": edge_arrays(self._refused.edges),
+            "last": self._last,
+            "counts": [self.count, self.refused, self.taken_back],
+        }
+
+    def load(
+        self, places: Mapping[str, NDArray[Any]], loops: Sequence[MeasuredLoop], loop_closures: int
+    ) -> None:
+        """Go on from a saved map.
+
+        Args:
+            places: see :meth:`PlaceRecogniser.state`.
+            loops: as they were measured.
+            loop_closures: that were closed in it.
+        """
+        self.places.restore(places)
+        self._loops = list(loops)
+        self.count = loop_closures
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        self.places.restore(state["places"])
+        self._loops = loops_of(state["loops"])
+        self._refused.restore(edges_of(state["refused_edges"], is_loop=True))
+        last = state["last"]
+        self._last = None if last is None else (last[0], last[1])
+        self.count, self.refused, self.taken_back = state["counts"]
 
     def _is_new(self, keyframe: int, candidate: int) -> bool:
         if self._last is None:

@@ -95,6 +95,15 @@ class RefusedLoops:
         if drift.explains(edge):
             self._edges.append(edge)
 
+    @property
+    def edges(self) -> list[Edge]:
+        """Those that are remembered."""
+        return list(self._edges)
+
+    def restore(self, edges: list[Edge]) -> None:
+        """Remember these, and no other."""
+        self._edges = list(edges)
+
     def clear(self) -> None:
         """Drop all, after the map was corrected."""
         self._edges.clear()

@@ -3,13 +3,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slamdepth.backend.pose_graph import Edge
 from slamdepth.mapping.map_view import MapView
 from slamdepth.typing import Floats, Ints
+
+Arrays = Mapping[str, NDArray[Any]]
 
 STEP_SIGMAS = (0.01, 0.02, 0.02)
 """Deviation of the step from one keyframe to the next: radians, metres, natural logarithm of the scale."""
@@ -82,3 +87,38 @@ class MeasuredLoop:
     def renumbered(self, first: int) -> MeasuredLoop:
         """The same loop where the numbers of its keyframes grow by ``first``."""
         return replace(self, edge=replace(self.edge, i=self.edge.i + first, j=self.edge.j + first))
+
+
+def edge_arrays(edges: Sequence[Edge]) -> dict[str, NDArray[Any]]:
+    """Edges of the pose graph."""
+    return {
+        "keyframes": np.array([(e.i, e.j) for e in edges], dtype=np.int64).reshape(-1, 2),
+        "T_i_j": np.array([e.T_i_j for e in edges], dtype=np.float64).reshape(-1, 4, 4),
+        "scale_i_j": np.array([e.scale_i_j for e in edges], dtype=np.float64),
+        "sigmas": np.array([e.sigmas for e in edges], dtype=np.float64).reshape(-1, 3),
+    }
+
+
+def edges_of(arrays: Arrays, *, is_loop: bool) -> list[Edge]:
+    """What :func:`edge_arrays` was given."""
+    return [
+        Edge(int(i), int(j), np.array(T), float(scale), (float(a), float(b), float(c)), is_loop=is_loop)
+        for (i, j), T, scale, (a, b, c) in zip(
+            arrays["keyframes"], arrays["T_i_j"], arrays["scale_i_j"], arrays["sigmas"], strict=True
+        )
+    ]
+
+
+def loop_arrays(loops: Sequence[MeasuredLoop]) -> dict[str, NDArray[Any]]:
+    """Loops as they were measured."""
+    units = np.array([(loop.unit_i, loop.unit_j) for loop in loops], dtype=np.float64).reshape(-1, 2)
+    return {**edge_arrays([loop.edge for loop in loops]), "units": units}
+
+
+def loops_of(arrays: Arrays) -> list[MeasuredLoop]:
+    """What :func:`loop_arrays` was given."""
+    edges = edges_of(arrays, is_loop=True)
+    return [
+        MeasuredLoop(edge, float(units[0]), float(units[1]))
+        for edge, units in zip(edges, arrays["units"], strict=True)
+    ]

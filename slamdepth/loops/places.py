@@ -8,8 +8,8 @@ geometric verification, never a loop by itself.
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -109,6 +109,16 @@ class PlaceRecogniser:
         """Take over all keyframes of another index; their ids grow by ``first``."""
         for keyframe_id in other._ids:
             self.add_vector(first + keyframe_id, other.vector(keyframe_id))
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Ids and place vectors of all keyframes."""
+        n = len(self._ids)
+        return {"keyframe": np.array(self._ids, dtype=np.int64), "vector": self._vectors[:n].copy()}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Remember what :meth:`state` gave; nothing else is remembered yet."""
+        for keyframe_id, vector in zip(state["keyframe"].tolist(), state["vector"], strict=True):
+            self.add_vector(keyframe_id, vector)
 
     def score(self, first_id: int, second_id: int) -> float:
         """Cosine of the place vectors of two keyframes.

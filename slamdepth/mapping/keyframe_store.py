@@ -7,14 +7,16 @@ the other. Beyond the budget, the oldest are spilled to a temporary file and rea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
+from slamdepth.errors import TrackingError
 from slamdepth.mapping.codec import encode_half_precision, encode_image, encode_sensor_depth
 from slamdepth.mapping.spill_file import SpilledArray, SpillFile
-from slamdepth.types import DepthPrediction, Frame
+from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
 _NEWEST = 8  # never spilled: tracking still reads them
@@ -33,19 +35,51 @@ class StoredFrame:
         self._resident: Frame | None = frame
         self._image: SpilledArray | None = None
         self._depth: SpilledArray | None = None
+        self._read: Callable[[], Frame] | None = None
+
+    @classmethod
+    def of_saved(
+        cls,
+        index: int,
+        timestamp_s: float,
+        camera: Camera,
+        gravity: NDArray[np.float64] | None = None,
+        read: Callable[[], Frame] | None = None,
+    ) -> StoredFrame:
+        """Handle of a frame of a saved map or of an earlier process.
+
+        Args:
+            read: reads the frame; None where its image was not kept.
+        """
+        stored = cls.__new__(cls)
+        stored.index, stored.timestamp_s, stored.camera, stored.gravity = index, timestamp_s, camera, gravity
+        stored._resident = stored._image = stored._depth = None
+        stored._read = read
+        return stored
 
     @property
     def is_spilled(self) -> bool:
         return self._resident is None
 
+    @property
+    def is_kept(self) -> bool:
+        """Whether :meth:`load` can give the frame."""
+        return not (self._resident is None and self._image is None and self._read is None)
+
     def load(self) -> Frame:
         """The frame; where it was spilled, read from the file each time.
 
         Depth is what it was to the bit. The colours of a spilled frame are those of a JPEG of quality 95.
+
+        Raises:
+            TrackingError: it belongs to a map that was saved without images.
         """
         if (frame := self._resident) is not None:
             return frame
-        assert self._image is not None
+        if self._read is not None:
+            return self._read()
+        if self._image is None:
+            raise TrackingError(f"the image of frame {self.index} was not saved with the map")
         depth_m = None if self._depth is None else self._depth.load()
         return Frame(
             self.index, self.timestamp_s, self._image.load(), self.camera, depth_m, gravity=self.gravity
@@ -76,19 +110,55 @@ class StoredPrediction:
         self._resident: DepthPrediction | None = prediction
         self._values: SpilledArray | None = None
         self._sigma_log: SpilledArray | None = None
+        self._read: Callable[[], DepthPrediction] | None = None
+
+    @classmethod
+    def of_saved(
+        cls,
+        kind: DepthKind,
+        *,
+        is_sensor: bool,
+        gravity: NDArray[np.float64] | None = None,
+        gravity_share: float = 0.0,
+        scale_sigma_log: float | None = None,
+        read: Callable[[], DepthPrediction] | None = None,
+    ) -> StoredPrediction:
+        """Handle of a prediction of a saved map or of an earlier process.
+
+        Args:
+            read: reads the prediction; None where its maps were not kept.
+        """
+        stored = cls.__new__(cls)
+        stored.kind, stored.is_sensor = kind, is_sensor
+        stored.gravity, stored.gravity_share = gravity, gravity_share
+        stored.scale_sigma_log = scale_sigma_log
+        stored._resident = stored._values = stored._sigma_log = None
+        stored._read = read
+        return stored
 
     @property
     def is_spilled(self) -> bool:
         return self._resident is None
 
+    @property
+    def is_kept(self) -> bool:
+        """Whether :meth:`load` can give the prediction."""
+        return not (self._resident is None and self._values is None and self._read is None)
+
     def load(self) -> DepthPrediction:
         """The prediction; where it was spilled, read from the file each time.
 
         A spilled sensor map is what it was to the bit, a network's is rounded to half precision.
+
+        Raises:
+            TrackingError: it belongs to a map that was saved without images.
         """
         if (prediction := self._resident) is not None:
             return prediction
-        assert self._values is not None
+        if self._read is not None:
+            return self._read()
+        if self._values is None:
+            raise TrackingError("the depth of this keyframe was not saved with the map")
         return DepthPrediction(
             self._values.load(),
             self.kind,

@@ -9,14 +9,14 @@ A landmark that dies keeps its id, and one that was fused into another points th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from slamdepth.geometry import Similarity, invert, transform
 from slamdepth.mapping.keyframe_store import KeyframeStore, StoredFrame, StoredPrediction
-from slamdepth.mapping.landmarks import AdjustedLandmarks
+from slamdepth.mapping.landmarks import AdjustedLandmarks, Landmarks
 from slamdepth.mapping.map_keyframe import KeyframeState, MapKeyframe
 from slamdepth.mapping.map_view import NEAREST_M, MapView
 from slamdepth.types import DepthPrediction, Frame
@@ -39,10 +39,14 @@ class Map(MapView):
     Args:
         keyframe_memory_mib: budget for images and depth maps of keyframes; beyond it the oldest are
             spilled to a temporary file.
+
+    Attributes:
+        session: number of the recording that new keyframes come from.
     """
 
     def __init__(self, keyframe_memory_mib: float = math.inf) -> None:
         super().__init__()
+        self.session = 0
         self._compact_at = _COMPACT_FROM
         self._store = KeyframeStore(keyframe_memory_mib)
 
@@ -72,6 +76,7 @@ class Map(MapView):
             log_depth=np.full(count, np.nan),
             sigma_log=np.full(count, np.nan),
             velocity=np.zeros(6) if velocity is None else velocity.copy(),
+            session=self.session,
         )
         self._states.append(state)
         self._sights.note(state.id, landmark_ids)
@@ -354,17 +359,54 @@ class Map(MapView):
         own.distance_m[ids] = distance
         own.direction_w[ids] = offset / distance[:, None]
 
-    def compact(self) -> Ints | None:
+    def restore(
+        self,
+        states: Sequence[KeyframeState],
+        landmarks: Landmarks,
+        starts: Iterable[int],
+        compact_at: int | None = None,
+    ) -> None:
+        """Fill an empty map with what was saved of one.
+
+        Args:
+            states: with ids from 0.
+            landmarks: copied.
+            compact_at: number of landmarks that the next :meth:`compact` waits for; None as after one.
+        """
+        size = len(landmarks)
+        self._states = list(states)
+        self._own = landmarks.moved(np.arange(size), max(_COMPACT_FROM, size))
+        self.landmarks = self._own.read_only(size)
+        self._sights.rebuild(state.landmark_ids for state in self._states)
+        self.keyframes = tuple(MapKeyframe(state) for state in self._states)
+        self.starts = frozenset(starts)
+        self._compact_at = max(_COMPACT_FROM, 2 * size) if compact_at is None else compact_at
+
+    def begin_sessions(self) -> None:
+        """All keyframes come from one recording, which is the first one of the map."""
+        self.session = 0
+        for state in self._states:
+            state.session = 0
+
+    @property
+    def compact_at(self) -> int:
+        """Number of landmarks that the next :meth:`compact` waits for."""
+        return self._compact_at
+
+    def compact(self, *, at_once: bool = False) -> Ints | None:
         """Give away the ids of landmarks that are gone, once there are twice as many as after the last time.
 
         The order of the others stays.
+
+        Args:
+            at_once: however few there are.
 
         Returns:
             ``(size + 1,)`` the new id of each landmark, -1 where it is gone, and a last -1 for none: whoever
             remembers ids must look them up. None where nothing changed.
         """
         n = self.size
-        if n < self._compact_at:
+        if n < self._compact_at and not at_once:
             return None
         is_kept = np.append(self.landmarks.alive, False)
         for state in self._states:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -35,6 +36,7 @@ class KeyframeState:
     predicted_log_depth: Floats = field(default_factory=lambda: np.zeros(0))
     scale: float = 1.0
     unit: float = 1.0
+    session: int = 0
 
 
 class MapKeyframe:
@@ -55,6 +57,7 @@ class MapKeyframe:
         velocity: ``(6,)`` m/s and rad/s in the camera frame when the image was taken.
         unit: product of the scales of all corrections of this keyframe: what was one metre when the
             keyframe was made.
+        session: number of the recording it comes from, 0 for the first one of its map.
     """
 
     __slots__ = ("_state",)
@@ -120,6 +123,10 @@ class MapKeyframe:
     def unit(self) -> float:
         return self._state.unit
 
+    @property
+    def session(self) -> int:
+        return self._state.session
+
 
 @dataclass(frozen=True)
 class AnchoredPose:
@@ -139,6 +146,19 @@ class AnchoredPose:
     def of(T_camera_world: Floats, keyframe: MapKeyframe) -> AnchoredPose:
         """Anchor a pose ``(4, 4)`` to ``keyframe``."""
         return AnchoredPose(keyframe, T_camera_world @ keyframe.T_world_camera, keyframe.unit)
+
+    def state(self) -> dict[str, Any]:
+        """The pose as plain values, for a checkpoint."""
+        return {
+            "keyframe": self.keyframe.id,
+            "T_camera_keyframe": self.T_camera_keyframe,
+            "unit": self.unit,
+        }
+
+    @staticmethod
+    def restored(state: dict[str, Any], keyframes: Sequence[MapKeyframe]) -> AnchoredPose:
+        """What :meth:`state` gave, relative to the keyframe of that id."""
+        return AnchoredPose(keyframes[state["keyframe"]], np.array(state["T_camera_keyframe"]), state["unit"])
 
     @property
     def T_camera_world(self) -> Floats:

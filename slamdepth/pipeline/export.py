@@ -6,10 +6,14 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from slamdepth.datasets import Dataset, open_dataset
+from slamdepth.depth.gravity_consensus import GravityConsensus
 from slamdepth.errors import ConfigError, InputError, SlamdepthError
 from slamdepth.export import (
     FORMATS,
@@ -24,7 +28,9 @@ from slamdepth.export.registry import Progress
 from slamdepth.export.write import check_place
 from slamdepth.io import read_tum_trajectory
 from slamdepth.mapping.reconstruction import Reconstruction
-from slamdepth.pipeline.folder import EXPORTS, MAPS, RunFolder, is_run, recorded_arguments
+from slamdepth.mapstore import Map
+from slamdepth.mapstore.map import is_map
+from slamdepth.pipeline.folder import EXPORTS, MAP, MAPS, RunFolder, is_run, recorded_arguments
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
 
 logger = logging.getLogger(__name__)
@@ -72,7 +78,7 @@ def export_run(
     place = check_place(
         default_place(folder, to, map_number) if output is None else Path(output), overwrite=overwrite
     )
-    scene = scene_of_folder(folder, map_number)
+    scene = scene_of_folder(folder, map_number, with_tracks=kind.has_images)
     dataset = None
     if kind.has_images and (mode is not ImageMode.NONE or scene.camera is None):
         dataset = _recording(folder, recording, camera)
@@ -148,8 +154,12 @@ def default_place(run: Path, name: str, map_number: int) -> Path:
     return run / EXPORTS / (name if map_number == 1 else f"{name}-map{map_number}")
 
 
-def scene_of_folder(folder: Path, map_number: int = 1) -> ExportScene:
+def scene_of_folder(folder: Path, map_number: int = 1, *, with_tracks: bool = True) -> ExportScene:
     """The scene of a run folder.
+
+    Args:
+        map_number: 1 for the largest map.
+        with_tracks: read keypoints and landmarks of the saved map, where there is one.
 
     Raises:
         InputError: a file is missing or damaged, or there is no such map.
@@ -164,7 +174,7 @@ def scene_of_folder(folder: Path, map_number: int = 1) -> ExportScene:
     scale = (maps[map_number - 1] if map_number <= len(maps) else {}).get("scale") or {}
     readout_ms = (report.get("rolling_shutter") or {}).get("readout_ms")
     mesh, cloud = place / "mesh.ply", place / "cloud.ply"
-    return ExportScene(
+    scene = ExportScene(
         str(report.get("sequence", folder.name)),
         trajectory,
         tuple(
@@ -174,6 +184,44 @@ def scene_of_folder(folder: Path, map_number: int = 1) -> ExportScene:
         scale=str(scale.get("sentence", "not known")),
         mesh=mesh if mesh.is_file() else None,
         cloud=cloud if cloud.is_file() else None,
+    )
+    return with_saved_map(scene, Map.load(place / MAP)) if with_tracks and is_map(place / MAP) else scene
+
+
+def with_saved_map(scene: ExportScene, saved: Map) -> ExportScene:
+    """A scene with camera, keypoints, landmarks and gravity of a saved map in the same world.
+
+    Of a map of several recordings, only the views of the latest are exported: its images are at hand.
+    """
+    keyframes, landmarks = saved.groups["keyframes"], saved.groups["landmarks"]
+    seen = np.flatnonzero(landmarks["alive"] & (landmarks["observations"] >= 2))
+    rows = np.full(len(landmarks["alive"]) + 1, -1)  # the last is that of no landmark
+    rows[seen] = np.arange(len(seen))
+    pose_s = set(scene.trajectory.timestamps_s.tolist())
+    views = []
+    for n in np.flatnonzero(keyframes["session"] == len(saved.sessions) - 1).tolist():
+        time_s = float(keyframes["timestamp_s"][n])
+        if time_s in pose_s:
+            own = slice(*keyframes["first_feature"][n : n + 2].tolist())
+            views.append(
+                View(
+                    time_s,
+                    saved.T_world_camera[n],
+                    keyframes["raw_px"][own],
+                    rows[keyframes["landmark"][own]],
+                )
+            )
+    gravity, graph = GravityConsensus(), saved.groups["graph"]
+    gravity.restore(
+        {"gravity_w": graph["gravity_w"], "confidence": graph["gravity_confidence"], "queries": 0}
+    )
+    return replace(
+        scene,
+        views=tuple(sorted(views, key=lambda view: view.timestamp_s)),
+        camera=saved.camera,
+        points_m=saved.points_m,
+        readout_s=saved.shutter[0],
+        gravity_w=gravity.in_world(),
     )
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from slamdepth.errors import OutputError
 from slamdepth.export import is_export
 from slamdepth.io import writable, write_text
+from slamdepth.mapstore import remove_map
 
 FILES = {
     "trajectory.txt": "every frame placed in the largest map, after optimisation (TUM, camera to world)",
@@ -33,6 +34,11 @@ FILES = {
     "README.txt": "this list, and the command for the same run again",
 }
 """What each file of a run folder holds."""
+
+MAP = "map"
+"""Folder of the map, for ``slamdepth localize --map`` and ``slamdepth run --map``."""
+
+MAP_CONTENT = "keyframes, landmarks, places and graph, for 'slamdepth localize --map' and 'run --map'"
 
 MAPS = "maps/"
 """Folder of the maps that never met the largest one: ``maps/2/``, ``maps/3/``, ..."""
@@ -112,7 +118,7 @@ class RunFolder:
             with writing(self.path):
                 self._remove_files()
         width = max(map(len, FILES))
-        content = {**FILES, MAPS: MAPS_CONTENT, EXPORTS: EXPORTS_CONTENT}
+        content = {**FILES, f"{MAP}/": MAP_CONTENT, MAPS: MAPS_CONTENT, EXPORTS: EXPORTS_CONTENT}
         lines = [f"{name:<{width}}  {what}" for name, what in content.items()]
         head = f"{_MARK}. A file that is missing was not asked for, or the run was killed before it.\n\n"
         if arguments:
@@ -149,6 +155,7 @@ class RunFolder:
                 if is_export(folder):
                     shutil.rmtree(folder)
             _remove_if_empty(exports)
+        remove_map(self.path / MAP)
         maps = self.path / MAPS
         if maps.is_symlink() or not maps.is_dir():
             return
@@ -156,6 +163,7 @@ class RunFolder:
             if folder.name.isdecimal() and folder.is_dir() and not folder.is_symlink():
                 for name in _MAP_FILES:
                     (folder / name).unlink(missing_ok=True)
+                remove_map(folder / MAP)
                 _remove_if_empty(folder)
         _remove_if_empty(maps)
 

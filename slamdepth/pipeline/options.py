@@ -26,6 +26,8 @@ class RunOptions:
         stride: take every Nth frame.
         mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
+        start_map: a run whose map this run goes on from.
+        map_images: keep images in the map.
         exports: formats that the result is exported to, see :func:`slamdepth.export_run`.
 
     Raises:
@@ -39,6 +41,8 @@ class RunOptions:
     stride: int = 1
     mesh: bool = True
     overwrite: bool = False
+    start_map: Path | None = None
+    map_images: bool = False
     exports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

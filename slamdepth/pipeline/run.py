@@ -24,12 +24,15 @@ from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.frontend.features import feature_weights
 from slamdepth.io import write_text
 from slamdepth.mapping.mesh import Mesh
+from slamdepth.mapstore import Map, Session
 from slamdepth.pipeline.dense import measure_depth
 from slamdepth.pipeline.export import check_exports, export_results
 from slamdepth.pipeline.folder import (
     EXPORTS,
     EXPORTS_CONTENT,
     FILES,
+    MAP,
+    MAP_CONTENT,
     MAPS,
     MAPS_CONTENT,
     RunFolder,
@@ -50,6 +53,7 @@ from slamdepth.pipeline.prediction_scale import (
     choose_prediction_scale,
 )
 from slamdepth.pipeline.results import judge_health, judge_trajectory, score_depth
+from slamdepth.pipeline.saved_maps import inherited_scale, start_map_notes, write_maps
 from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.surface import score_mesh
 from slamdepth.pipeline.tracking import AnyTracker, Tracked, track
@@ -69,6 +73,8 @@ def run(
     stride: int = 1,
     mesh: bool = True,
     overwrite: bool = False,
+    start_map: str | Path | None = None,
+    map_images: bool = False,
     export: Sequence[str] = (),
     progress: ProgressCallback | None = None,
     stop: threading.Event | None = None,
@@ -89,6 +95,8 @@ def run(
         stride: take every Nth frame.
         mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
+        start_map: a run folder (or the ``map`` in it) whose map this run goes on from and extends.
+        map_images: keep the keyframes' images in ``map/``.
         export: formats to export the result to, into ``export/`` of the run folder; see :func:`export_run`.
         progress: called after each frame and at the start of each stage.
         stop: set it, from any thread or a signal handler, to finish early with the frames tracked so far.
@@ -110,6 +118,8 @@ def run(
         stride,
         mesh,
         overwrite,
+        None if start_map is None else Path(start_map),
+        map_images,
         tuple(export),
     )
     settings = _settings(config, depth)
@@ -139,6 +149,7 @@ class _Job:
     model: DepthModel
     scale: PredictionScale
     tracker: AnyTracker
+    start_map: Map | None = None
 
     @property
     def depth_is_measured(self) -> bool:
@@ -160,6 +171,7 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
 
     check_exports(options.exports)
     config = with_chosen_model(config)
+    start_map = None if options.start_map is None else Map.load(options.start_map)
     dataset = open_dataset(options.sequence, options.camera_file)
     indices = options.indices(len(dataset))
     check_scale_options(dataset, config, indices)
@@ -182,8 +194,8 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     )
     model = scale.applied_to(given)
     seed_torch(config.seed)
-    tracker = create_tracker(dataset.camera, depth_model=model, config=config)
-    return _Job(options, config, dataset, indices, folder, model, scale, tracker)
+    tracker = create_tracker(dataset.camera, depth_model=model, config=config, start_map=start_map)
+    return _Job(options, config, dataset, indices, folder, model, scale, tracker, start_map)
 
 
 def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threading.Event) -> Tracked:
@@ -229,8 +241,20 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     )
     others, other_notes = settle_others(dataset, tracked.reconstruction, scale, config)
     reconstruction = replace(reconstruction, others=tuple(one.reconstruction for one in others))
-    write_trajectories(folder, (reconstruction, *reconstruction.others))
+    maps = (reconstruction, *reconstruction.others)
+    write_trajectories(folder, maps)
+    scale_facts = inherited_scale(scale_facts, job.tracker, 0, job.start_map)
+    write_maps(
+        folder,
+        job.tracker,
+        Session(dataset.name, job.model.name),
+        (tracked.reconstruction, *tracked.reconstruction.others),
+        maps,
+        (scale_facts, *(one.scale for one in others)),
+        with_images=job.options.map_images,
+    )
     notes = [*dataset.notes, *tracked.notes, *scale_notes, *other_notes]
+    notes += start_map_notes(job.tracker, job.start_map)
     mesh: Mesh | None = None
     mesh_images: tuple[MeshImage, ...] = ()
     if job.options.mesh:
@@ -281,6 +305,8 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     )
     absent = {name for name, is_there in optional if not is_there}
     files = {name: what for name, what in FILES.items() if name not in absent}
+    if (folder / MAP).is_dir():
+        files[f"{MAP}/"] = MAP_CONTENT
     files |= {MAPS: MAPS_CONTENT} if others else {}
     files |= {EXPORTS: EXPORTS_CONTENT} if (folder / EXPORTS).is_dir() else {}
     tell(RunProgress(RunStage.REPORTING))
@@ -334,9 +360,14 @@ def seed_torch(seed: int) -> None:
 def _reported_options(options: RunOptions, tracked: Tracked) -> dict[str, object]:
     """The options without paths: a report is passed on, folders of a machine are not."""
     asked = asdict(options)
-    for name in ("sequence", "output", "overwrite", "camera_file"):
+    for name in ("sequence", "output", "overwrite", "camera_file", "start_map"):
         asked.pop(name)
-    return {**asked, "camera_file": options.camera_file is not None, "interrupted": tracked.interrupted}
+    return {
+        **asked,
+        "camera_file": options.camera_file is not None,
+        "start_map": options.start_map is not None,
+        "interrupted": tracked.interrupted,
+    }
 
 
 def _arguments(options: RunOptions) -> list[str]:
@@ -350,6 +381,10 @@ def _arguments(options: RunOptions) -> list[str]:
         arguments += ["--stride", str(options.stride)]
     if options.exports:
         arguments += ["--export", ",".join(options.exports)]
+    if options.start_map is not None:
+        arguments += ["--map", str(options.start_map)]
+    if options.map_images:
+        arguments.append("--map-images")
     return arguments if options.mesh else [*arguments, "--no-mesh"]
 
 

@@ -17,14 +17,13 @@ from slamdepth.frontend.features import Features
 from slamdepth.loops.look_alikes import View, fits
 from slamdepth.loops.meeting import Meeting, Meetings, find_meeting
 from slamdepth.mapping.map_keyframe import MapKeyframe
-from slamdepth.tracking.map_tracker import MapTracker, Placed
+from slamdepth.tracking.map_tracker import FEWEST_FRAMES, MapTracker, Placed
 from slamdepth.types import Frame
 
 log = logging.getLogger(__name__)
 
 _PATIENCE_S = 1.0  # that a map waits for the camera to return
 _FIRST_WAIT_S = 0.1  # after the second young map that fails in a row; doubled by each further one
-_FEWEST_FRAMES = 10  # a smaller map is not kept: nothing has confirmed its poses
 _LOOKED_AT = 2  # maps that a frame or a keyframe is looked for in: those with the most similar places
 
 
@@ -39,6 +38,7 @@ class Atlas:
         active: the one that the camera is in, or was in last.
         joined: how often two maps became one.
         dropped_frames: frames of maps that were not kept.
+        finished: the maps of the result, the largest first; empty before the end.
     """
 
     def __init__(self, make: Callable[[int], MapTracker], config: Config) -> None:
@@ -49,6 +49,7 @@ class Atlas:
         self.maps.append(self.active)
         self.joined = 0
         self.dropped_frames = 0
+        self.finished: tuple[MapTracker, ...] = ()
         self._started = 1
         self._failed = 0  # young maps in a row that the camera was lost in
         self._lost_since_s: float | None = None
@@ -69,7 +70,7 @@ class Atlas:
             placed = self._find(frame, raw) or self._start(frame, raw)
         if placed is not None:
             self._lost_since_s = None
-        if len(self.active.frames) >= _FEWEST_FRAMES:
+        if self.active.is_worth_keeping:
             self._failed = 0
         return placed
 
@@ -104,7 +105,7 @@ class Atlas:
 
     def _patience_s(self) -> float:
         """How long the active map waits for the camera; a young one that fails may have started badly."""
-        if len(self.active.frames) >= _FEWEST_FRAMES:
+        if self.active.is_worth_keeping:
             return _PATIENCE_S
         return 0.0 if self._failed == 0 else min(_PATIENCE_S, _FIRST_WAIT_S * 2.0 ** (self._failed - 1))
 
@@ -112,7 +113,7 @@ class Atlas:
         """Go on in another map; the one before is dropped where it is too small to be of use."""
         before = self.active
         before.leave()
-        if len(before.frames) < _FEWEST_FRAMES:
+        if not before.is_worth_keeping:
             self._failed += 1
             self.dropped_frames += len(before.frames)
             self.maps.remove(before)
@@ -194,6 +195,6 @@ class Atlas:
     def by_size(self) -> list[MapTracker]:
         """The maps to keep, the one with most frames first; never none."""
         ranked = sorted(self.maps, key=lambda map_: -len(map_.frames))
-        kept = [map_ for map_ in ranked if len(map_.frames) >= _FEWEST_FRAMES] or ranked[:1]
+        kept = [map_ for map_ in ranked if len(map_.frames) >= FEWEST_FRAMES] or ranked[:1]
         self.dropped_frames += sum(len(map_.frames) for map_ in ranked[len(kept) :])
         return kept

@@ -60,6 +60,7 @@ def finish_run(atlas: Atlas, config: Config, watch: Stopwatch, steps: int) -> Re
     atlas.active.integration.run_all()
     atlas.meet()
     kept = atlas.by_size()
+    atlas.finished = tuple(kept)
     atlas.active = kept[0]
     *others, largest = (_finish_map(tracked, config, watch, steps) for tracked in reversed(kept))
     notes = list(largest.notes)
@@ -81,7 +82,7 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
         tracked.integration, tracked.map, tracked.frames, tracked.shutter,
     )  # fmt: skip
     with watch.timed("final"):
-        final = optimise_map(map_, integration, frames, shutter, config)
+        final = optimise_map(map_, integration, frames, shutter, config, is_loaded=tracked.is_loaded)
     statistics = RunStatistics(
         frames=steps,
         tracked=len(frames),
@@ -95,7 +96,8 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
         readout_sigma_s=shutter.sigma_s,
         scale_votes=final.scale_votes,
     )
-    in_time = sorted(map_.keyframes, key=lambda keyframe: keyframe.frame.timestamp_s)
+    of_this_run = [keyframe for keyframe in map_.keyframes if keyframe.session == map_.session]
+    in_time = sorted(of_this_run, key=lambda keyframe: keyframe.frame.timestamp_s)
     seen = map_.seen_by(2)
     rows = np.full(map_.size + 1, -1)  # the last is that of no landmark
     rows[seen] = np.arange(len(seen))
@@ -121,12 +123,22 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
 
 
 def optimise_map(
-    map_: Map, integration: KeyframeIntegration, frames: FrameLog, shutter: RollingShutter, config: Config
+    map_: Map,
+    integration: KeyframeIntegration,
+    frames: FrameLog,
+    shutter: RollingShutter,
+    config: Config,
+    *,
+    is_loaded: bool = False,
 ) -> FinalMap:
-    """Global bundle adjustment and metric scale."""
+    """Global bundle adjustment and metric scale.
+
+    Args:
+        is_loaded: the map goes on from a saved one: it keeps that one's scale, and needs no other start.
+    """
     notes: list[str] = []
     is_adjusted = config.bundle.final and len(map_.keyframes) >= 3
-    if is_adjusted and _adjust_all(map_, integration, frames, shutter):
+    if is_adjusted and _adjust_all(map_, integration, frames, shutter, from_two_starts=not is_loaded):
         notes.append(
             "keyframes that share few landmarks were re-registered from those that share many: their "
             "poses while the tracker ran were wrong"
@@ -136,13 +148,21 @@ def optimise_map(
     dropped = integration.mapper.dropped
     if dropped:
         notes.append(f"{dropped} predicted depth maps disagreed with the map and were not used")
-    return FinalMap(tuple(notes), () if map_.is_measured else _make_metric(map_))
+    return FinalMap(tuple(notes), () if map_.is_measured or is_loaded else _make_metric(map_))
 
 
 def _adjust_all(
-    map_: Map, integration: KeyframeIntegration, frames: FrameLog, shutter: RollingShutter
+    map_: Map,
+    integration: KeyframeIntegration,
+    frames: FrameLog,
+    shutter: RollingShutter,
+    *,
+    from_two_starts: bool,
 ) -> bool:
     """Adjust everything, search again for what the better map predicts to be seen, and adjust once more.
+
+    Args:
+        from_two_starts: also try another start.
 
     Returns:
         Whether another start was better, see :mod:`slamdepth.backend.resection`.
@@ -152,7 +172,8 @@ def _adjust_all(
     _follow_motion(frames, shutter)
     adjuster.adjust(every, [], map_.seen_by(2), (3, 5))
     # a sensor's depth leaves no bad start to be found
-    is_other = not map_.is_measured and adjuster.adjust_from_two_starts(every, map_.seen_by(2), _OTHER_START)
+    may_be_bad = from_two_starts and not map_.is_measured
+    is_other = may_be_bad and adjuster.adjust_from_two_starts(every, map_.seen_by(2), _OTHER_START)
     for n in range(_PASSES):
         before_s = shutter.readout_s
         if shutter.is_estimated:

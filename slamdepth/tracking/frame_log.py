@@ -14,6 +14,7 @@ from slamdepth.frontend.features import Features
 from slamdepth.frontend.pose import refine_pose
 from slamdepth.frontend.rolling_shutter import at_middle_row, inverse_depth, row_phase, velocity_between
 from slamdepth.geometry import invert
+from slamdepth.io.tree import Tree
 from slamdepth.mapping.map import Map
 from slamdepth.mapping.map_keyframe import AnchoredPose
 from slamdepth.mapping.placement import Placement
@@ -132,6 +133,58 @@ class FrameLog:
                 raw.sigma_px[at].astype(np.float32),
             )
         )
+
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint."""
+        placed = self._placed
+        counts = [len(p.landmark_ids) for p in placed]
+        none = np.zeros(0, dtype=np.float32)
+        return {
+            "timestamp_s": np.array([p.timestamp_s for p in placed], dtype=np.float64),
+            "flags": np.array([(p.is_keyframe, p.follows_motion, p.is_settled) for p in placed], np.bool_),
+            "quality": np.array([p.quality for p in placed], dtype=np.float64),
+            "keyframe": np.array([p.keyframe for p in placed], dtype=np.int64),
+            "T_camera_keyframe": np.array([p.pose.T_camera_keyframe for p in placed]).reshape(-1, 4, 4),
+            "unit": np.array([p.pose.unit for p in placed], dtype=np.float64),
+            "first": np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+            "landmark": np.concatenate([none.astype(np.int32), *(p.landmark_ids for p in placed)]),
+            "px": np.concatenate([none.reshape(0, 2), *(p.px for p in placed)]),
+            "phase": np.concatenate([none, *(p.phase for p in placed)]),
+            "sigma_px": np.concatenate([none, *(p.sigma_px for p in placed)]),
+            "ids_now": self._ids_now,
+            "counts": [self.withdrawn, self._settled, self._prune_at],
+        }
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        first = state["first"].tolist()
+        keyframes = self._map.keyframes
+        self._placed = []
+        for n, (is_keyframe, follows_motion, is_settled) in enumerate(state["flags"].tolist()):
+            at = slice(first[n], first[n + 1])
+            T_camera_keyframe = np.array(state["T_camera_keyframe"][n])
+            keyframe = keyframes[int(state["keyframe"][n])]
+            self._placed.append(
+                _Placed(
+                    float(state["timestamp_s"][n]),
+                    is_keyframe,
+                    follows_motion,
+                    float(state["quality"][n]),
+                    AnchoredPose(keyframe, T_camera_keyframe, float(state["unit"][n])),
+                    np.array(state["landmark"][at]),
+                    np.array(state["px"][at]),
+                    np.array(state["phase"][at]),
+                    np.array(state["sigma_px"][at]),
+                    is_settled,
+                )
+            )
+        self._ids_now = np.array(state["ids_now"])
+        self.withdrawn, self._settled, self._prune_at = state["counts"]
+
+    @property
+    def poses(self) -> list[tuple[float, AnchoredPose]]:
+        """Time and pose of each placed frame, in order."""
+        return [(placed.timestamp_s, placed.pose) for placed in self._placed]
 
     def withdraw(self, times_s: Sequence[float]) -> None:
         """Forget the poses of frames of these times; keyframes keep theirs."""

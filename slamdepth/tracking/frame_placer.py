@@ -51,6 +51,7 @@ class FramePlacer:
         self._parts = parts
         self._watch = run.watch
         self._wide_features = run.wide_features
+        self._counts_views = run.grows_maps
 
     def place(self, frame: Frame, raw: Features) -> Found | None:
         """Place a frame in the map; None where the camera is lost, and its motion forgotten."""
@@ -127,7 +128,8 @@ class FramePlacer:
         if placement is None or not self._is_earned(frame, features, placement):
             return None
         self._parts.placed_by[placement.placed_by] += 1
-        self._parts.map.count_views(placement.expected_ids, placement.found_ids)
+        if self._counts_views:
+            self._parts.map.count_views(placement.expected_ids, placement.found_ids)
         was_cut = placement.placed_by is PlacedBy.LAST_KEYFRAME and not self._parts.view_change.is_large
         if was_cut or placement.placed_by is PlacedBy.PLACE:
             self._parts.motion.forget()  # found by its view alone: the recording may have been cut

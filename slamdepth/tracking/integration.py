@@ -23,6 +23,7 @@ from slamdepth.backend.bundle_problem import BundleResult
 from slamdepth.config import Config
 from slamdepth.depth.gravity_consensus import GravityConsensus
 from slamdepth.frontend.features import Features
+from slamdepth.io.tree import Tree
 from slamdepth.loops.closer import LoopCloser
 from slamdepth.loops.meeting import Meeting
 from slamdepth.mapping.map import Map, MapKeyframe
@@ -87,6 +88,30 @@ class KeyframeIntegration:
         self._complete: list[MapKeyframe] = []
         self._is_adjusting = False
         self._readout: Future[BundleResult] | None = None
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether no keyframe waits and no thread computes anything that the map will take over."""
+        return not self._waiting and self._readout is None and not self._is_adjusting
+
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint; it must be quiet."""
+        assert self.is_quiet
+        return {
+            "loops": self.loops.state(),
+            "policy": self._policy.state(),
+            "gravity": self.gravity.state(),
+            "complete": [keyframe.id for keyframe in self._complete],
+            "dropped": self.mapper.dropped,
+        }
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        self.loops.restore(state["loops"])
+        self._policy.restore(state["policy"])
+        self.gravity.restore(state["gravity"])
+        self._complete = [self._map.keyframes[k] for k in state["complete"]]
+        self.mapper.dropped = state["dropped"]
 
     def wants(self, placement: Placement) -> bool:
         """Whether a frame should become a keyframe; see :class:`KeyframePolicy`."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from slamdepth.config import Config
 from slamdepth.geometry import rotation_angle_rad
+from slamdepth.io.tree import Tree
 from slamdepth.mapping.map_keyframe import MapKeyframe
 from slamdepth.mapping.map_view import MapView
 from slamdepth.mapping.placement import Placement
@@ -85,6 +86,21 @@ class KeyframePolicy:
         D = placement.T_camera_world @ reference.T_world_camera
         turned = float(rotation_angle_rad(D[:3, :3]))
         return float(np.linalg.norm(D[:3, 3])) > _REGISTERED_STEP_M or turned > _REGISTERED_TURN_RAD
+
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint."""
+        return {
+            "reference": None if self._reference is None else self._reference.id,
+            "overlap": self._overlap,
+            "seen": self._seen,
+            "seen_share": self._seen_share,
+        }
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        reference = state["reference"]
+        self._reference = None if reference is None else self._map.keyframes[reference]
+        self._overlap, self._seen, self._seen_share = state["overlap"], state["seen"], state["seen_share"]
 
     def keyframe_made(self) -> None:
         """Measure from the keyframe that was just made."""

@@ -16,6 +16,7 @@ from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.integration import KeyframeIntegration
 from slamdepth.tracking.localiser import Localiser
 from slamdepth.tracking.motion import MotionModel
+from slamdepth.tracking.past_frames import PastFrames
 from slamdepth.tracking.pose_check import PoseCheck
 from slamdepth.tracking.relocaliser import Relocaliser
 from slamdepth.tracking.rolling_shutter import RollingShutter
@@ -34,6 +35,7 @@ class RunParts:
         workers: threads, and the depth model.
         watch: measures where the time goes.
         wide_features: finds more features of a frame, for a search over a wide baseline.
+        grows_maps: False where frames are placed in a map that must not change.
     """
 
     camera: Camera
@@ -42,6 +44,7 @@ class RunParts:
     workers: Workers
     watch: Stopwatch
     wide_features: Callable[[Frame], Features]
+    grows_maps: bool = True
 
 
 class MapParts:
@@ -55,6 +58,8 @@ class MapParts:
         id: number of the map, from 0 in the order of their start.
         map, frames, motion, shutter, localiser, check, view_change, integration, relocaliser: the parts.
         placed_by: how many frames were placed by what.
+        past: frames of earlier recordings, where the map was loaded.
+        is_loaded: the map, or a part of it, is of an earlier recording.
     """
 
     def __init__(self, id_: int, run: RunParts) -> None:
@@ -87,3 +92,5 @@ class MapParts:
             workers.depth,
         )
         self.placed_by: Counter[PlacedBy] = Counter()
+        self.past = PastFrames()
+        self.is_loaded = False

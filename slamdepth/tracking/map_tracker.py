@@ -21,7 +21,8 @@ from slamdepth.typing import Floats
 
 log = logging.getLogger(__name__)
 
-_SAME_MOTION = 0.8  # of a frame's landmarks agree still; of consecutive frames 0.92 and more
+FEWEST_FRAMES = 10
+"""A smaller map is not kept: nothing has confirmed its poses."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,8 @@ class MapTracker(MapParts):
         Returns:
             None where the camera is lost.
         """
-        self._compact()
+        if self._run.grows_maps:
+            self._compact()
         found = self._placer.place(frame, raw)
         return None if found is None else self._add(frame, found)
 
@@ -84,6 +86,32 @@ class MapTracker(MapParts):
         """Place a frame by what it looks like, in a map that the camera was not in."""
         found = self._placer.find(frame, raw)
         return None if found is None else self._add(frame, found)
+
+    @property
+    def is_worth_keeping(self) -> bool:
+        """Whether enough frames confirm the map, or an earlier recording made it."""
+        return self.is_loaded or len(self.frames) >= FEWEST_FRAMES
+
+    def place_alone(self, frame: Frame, raw: Features) -> Placed | None:
+        """Place an image by itself: no motion leads to it, and none from it.
+
+        Returns:
+            None also where other images would have to confirm its pose.
+        """
+        self.forget_motion()
+        found = self._placer.find(frame, raw)
+        is_sure = not self.check.is_provisional
+        placed = None
+        if found is not None and is_sure:
+            placed = self._placed(frame, found.features, found.placement, found.placed_by, is_keyframe=False)
+        self.forget_motion()
+        return placed
+
+    def forget_motion(self) -> None:
+        """The next image may have been taken anywhere."""
+        self.motion.forget()
+        self.check.lose()
+        self.check.forget_motion()
 
     def leave(self) -> None:
         """The camera is in another map from now on."""
@@ -121,6 +149,8 @@ class MapTracker(MapParts):
         ids = self.motion.landmark_ids
         self.motion.landmark_ids = np.where(ids >= 0, ids + first_landmark, -1)
         self.placed_by += other.placed_by
+        self.past.absorb(other.past)
+        self.is_loaded |= other.is_loaded
         self.shutter.adopt(other.shutter)
         self.integration.join(other.integration, first_keyframe, meetings)
         self.motion.follow_map()
@@ -131,7 +161,8 @@ class MapTracker(MapParts):
         follows_motion = self.motion.is_known
         if placement.is_loose and self.integration.awaits_landmarks:
             placement = self._placer.place_in_grown_map(features, placement)
-        is_keyframe = self.integration.wants(placement) and self._run.workers.depth.has_depth(frame)
+        is_keyframe = self._run.grows_maps and self.integration.wants(placement)
+        is_keyframe = is_keyframe and self._run.workers.depth.has_depth(frame)
         is_keyframe &= not self.check.is_provisional
         if is_keyframe and self.integration.is_full:
             placement = self._placer.place_in_grown_map(features, placement)

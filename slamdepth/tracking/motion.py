@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from slamdepth.frontend.rolling_shutter import velocity_between
 from slamdepth.geometry import invert, orthonormalised, se3_exp, se3_log
+from slamdepth.io.tree import Tree
 from slamdepth.mapping.map_keyframe import AnchoredPose, MapKeyframe
 from slamdepth.mapping.placement import Placement
 from slamdepth.typing import Floats, Ints
@@ -77,6 +80,25 @@ class MotionModel:
         self._T_camera_world = placement.T_camera_world
         self._last = AnchoredPose.of(placement.T_camera_world, keyframe)
         self.landmark_ids = placement.landmark_ids
+
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint."""
+        return {
+            "last_time_s": self.last_time_s,
+            "step": self.step,
+            "step_s": self._step_s,
+            "landmark_ids": self.landmark_ids,
+            "last": None if self._last is None else self._last.state(),
+            "T_camera_world": self._T_camera_world,
+        }
+
+    def restore(self, state: Tree, keyframes: Sequence[MapKeyframe]) -> None:
+        """Remember what :meth:`state` gave, in a map of these ``keyframes``."""
+        self.last_time_s, self._step_s = state["last_time_s"], state["step_s"]
+        self.step, self.landmark_ids = np.array(state["step"]), np.array(state["landmark_ids"])
+        last = state["last"]
+        self._last = None if last is None else AnchoredPose.restored(last, keyframes)
+        self._T_camera_world = np.array(state["T_camera_world"])
 
     def rescale(self, factor: float) -> None:
         """Follow a map whose metres were multiplied by ``factor``."""

@@ -8,8 +8,10 @@ import numpy as np
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.moving import moving_share
 from slamdepth.geometry import invert
+from slamdepth.io.tree import Tree
 from slamdepth.mapping.map_view import MapView, median_depth_m
 from slamdepth.mapping.placement import Placement
+from slamdepth.tracking.map_arrays import features_of, features_state, metric_of, metric_state
 from slamdepth.types import Camera
 from slamdepth.typing import Floats, Ints
 
@@ -32,6 +34,29 @@ class MovingThings:
         self._map = map_
         self._last: tuple[float, Features, Floats, Ints] | None = None
         self._share: float | None = None
+
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint."""
+        if self._last is None:
+            return {"last": None, "share": self._share}
+        timestamp_s, features, T_camera_world, ids = self._last
+        last = {
+            "timestamp_s": timestamp_s,
+            "features": features_state(features),
+            "metric": metric_state(features.metric),
+            "T_camera_world": T_camera_world,
+            "landmark_ids": ids,
+        }
+        return {"last": last, "share": self._share}
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        self._share, last = state["share"], state["last"]
+        self._last = None
+        if last is not None:
+            features = features_of(last["features"], metric_of(last["metric"]))
+            pose, ids = np.array(last["T_camera_world"]), np.array(last["landmark_ids"])
+            self._last = last["timestamp_s"], features, pose, ids
 
     def forget(self) -> None:
         """The last pose is in another world frame now."""

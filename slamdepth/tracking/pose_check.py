@@ -12,6 +12,7 @@ import numpy as np
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.pose import cells_of, pose_covariance
 from slamdepth.geometry import CHI2_2DOF_95
+from slamdepth.io.tree import Tree
 from slamdepth.mapping.map_view import MapView, median_depth_m
 from slamdepth.mapping.placement import PlacedBy, Placement
 from slamdepth.tracking.localiser import FARTHEST_PX, POSE_PX, Localiser
@@ -86,6 +87,21 @@ class PoseCheck:
         self.moving = MovingThings(camera, map_)
         self._last_s = -math.inf
         self._provisional_s: list[float] = []
+
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint."""
+        return {
+            "last_s": self._last_s,
+            "provisional_s": list(self._provisional_s),
+            "uncertainty": self.uncertainty.state(),
+            "moving": self.moving.state(),
+        }
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        self._last_s, self._provisional_s = state["last_s"], list(state["provisional_s"])
+        self.uncertainty.restore(state["uncertainty"])
+        self.moving.restore(state["moving"])
 
     @property
     def is_provisional(self) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.pose import pose_covariance
+from slamdepth.io.tree import Tree
 from slamdepth.mapping.map_view import MapView, median_depth_m
 from slamdepth.mapping.placement import Placement
 from slamdepth.types import Camera
@@ -48,6 +49,16 @@ class PoseUncertainty:
         self._map = map_
         self._last: tuple[float, Floats] | None = None  # time and T_camera_world
         self.image_sigma = 0.0
+
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint."""
+        return {"last": self._last, "image_sigma": self.image_sigma}
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        last = state["last"]
+        self._last = None if last is None else (last[0], np.array(last[1]))
+        self.image_sigma = state["image_sigma"]
 
     def forget_motion(self) -> None:
         """The last pose is in another world frame now."""

@@ -19,6 +19,7 @@ from slamdepth.config import Config
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.registration import RegistrationConfig, depth_to_cloud, register_cloud
 from slamdepth.geometry import invert, project, se3_exp, se3_log, transform
+from slamdepth.io.tree import Tree
 from slamdepth.loops.look_alikes import Place, Reach, View, distance_seen_m, fits, fits_elsewhere
 from slamdepth.loops.places import PlaceRecogniser
 from slamdepth.mapping.map_keyframe import MapKeyframe
@@ -74,6 +75,15 @@ class Relocaliser:
         self._frame_s = 1.0 / camera.fps
         self.others: Callable[[], Sequence[Place]] = tuple
         self.schedule = RegistrationSchedule()
+
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint."""
+        return {"schedule": self.schedule.state(), "clouds": self._clouds.state()}
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        self.schedule.restore(state["schedule"])
+        self._clouds.restore(state["clouds"])
 
     def by_place(
         self, features: Features, *, without: int | None = None, reach: Reach | None = None
@@ -208,6 +218,22 @@ class RegistrationSchedule:
         self._lost = 0
         self._tried = 0  # the lost frame tried last
 
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint."""
+        return {
+            "T_camera_world": self._T_camera_world,
+            "step": self._step,
+            "lost": self._lost,
+            "tried": self._tried,
+        }
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        T = state["T_camera_world"]
+        self._T_camera_world = None if T is None else np.array(T)
+        self._step = np.array(state["step"])
+        self._lost, self._tried = state["lost"], state["tried"]
+
     def start(self, T_camera_world: Floats, step: Floats) -> None:
         """The camera was lost at this frame; a frame ago it was at ``T_camera_world`` after ``step``.
 
@@ -270,6 +296,14 @@ class _CloudRegistration:
         self._map = map_
         self._clouds: dict[int, Floats] = {}
 
+    def state(self) -> Tree:
+        """The clouds that are cached: they keep the scale that their keyframes had."""
+        return {str(k): cloud for k, cloud in self._clouds.items()}
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        self._clouds = {int(k): np.array(cloud) for k, cloud in state.items()}
+
     def register(
         self, prediction: DepthPrediction, T_camera_world_guess: Floats, *, is_old: bool
     ) -> Floats | None:
@@ -282,8 +316,8 @@ class _CloudRegistration:
         scale = 1.0 if prediction.is_sensor else self._map.keyframes[-1].scale
         depth_m = prediction.values * np.float32(scale)
         cloud_c = self._cloud(depth_m)
-        recent = self._map.keyframes[-_CLOUD_KEYFRAMES:]
-        map_w = np.concatenate([self._keyframe_cloud_w(k) for k in recent])
+        recent = [k for k in self._map.keyframes[-_CLOUD_KEYFRAMES:] if _has_depth(k)]
+        map_w = np.concatenate([np.zeros((0, 3)), *(self._keyframe_cloud_w(k) for k in recent)])
         if len(cloud_c) < 200 or len(map_w) < 200:
             return None
         config = _OLD_GUESS if is_old else None
@@ -323,3 +357,9 @@ class _CloudRegistration:
             for old in [k for k in self._clouds if k <= keyframe.id - 2 * _CLOUD_KEYFRAMES]:
                 del self._clouds[old]
         return transform(keyframe.T_world_camera, self._clouds[keyframe.id])
+
+
+def _has_depth(keyframe: MapKeyframe) -> bool:
+    """Whether the depth of a keyframe can be read; that of a saved map may not have been kept."""
+    assert keyframe.prediction is not None
+    return keyframe.prediction.is_kept

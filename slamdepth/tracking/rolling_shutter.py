@@ -11,6 +11,7 @@ import numpy as np
 from slamdepth.config import ShutterConfig
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.rolling_shutter import at_middle_row, inverse_depth, px_per_readout_s, row_phase
+from slamdepth.io.tree import Tree
 from slamdepth.mapping.map import Map, MapKeyframe
 from slamdepth.mapping.placement import Placement
 from slamdepth.tracking.motion import MotionModel
@@ -135,6 +136,27 @@ class RollingShutter:
         self.readout_s, self.sigma_s = other.readout_s, other.sigma_s
         for keyframe in self._map.keyframes:
             self.correct_keyframe(keyframe)
+
+    def state(self) -> Tree:
+        """What it has found out, for a checkpoint."""
+        return {
+            "trusts_motion": self.trusts_motion,
+            "readout_s": self.readout_s,
+            "sigma_s": self.sigma_s,
+            "next_estimate": self._next_estimate,
+        }
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave; keyframes stay as they are."""
+        self.trusts_motion = state["trusts_motion"]
+        self.readout_s, self.sigma_s = state["readout_s"], state["sigma_s"]
+        self._next_estimate = state["next_estimate"]
+
+    def go_on_from(self, readout_s: float, sigma_s: float | None, keyframes: int) -> None:
+        """Take over what is known of the camera from a saved map with so many keyframes."""
+        if self._may_estimate:
+            self.readout_s, self.sigma_s = readout_s, sigma_s
+        self._next_estimate = max(_FIRST_ESTIMATE, keyframes + _FIRST_ESTIMATE)
 
     def px_rate(self, keyframe: MapKeyframe, at: Ints) -> Floats:
         """Pixels ``(M, 2)`` by which a second of readout time moves features ``at (M,)`` of a keyframe."""

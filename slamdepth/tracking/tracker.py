@@ -8,15 +8,15 @@ from types import TracebackType
 import numpy as np
 
 from slamdepth.config import Config
-from slamdepth.depth.base import DepthModel
+from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.metric import metric_model
-from slamdepth.errors import TrackingError
+from slamdepth.errors import DatasetError, TrackingError
 from slamdepth.frontend.compiled import load
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.preparation import Preparation, Prepared
 from slamdepth.geometry import invert
-from slamdepth.mapping.placement import PlacedBy
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.mapstore import Map, Session
 from slamdepth.stopwatch import Stopwatch
 from slamdepth.thread_limits import single_threaded
 from slamdepth.tracking.atlas import Atlas
@@ -24,18 +24,11 @@ from slamdepth.tracking.finish import finish_run
 from slamdepth.tracking.frame_log import check_frame
 from slamdepth.tracking.map_parts import RunParts
 from slamdepth.tracking.map_tracker import MapTracker, Placed
+from slamdepth.tracking.saved_maps import MapInfo, load_map, save_map
+from slamdepth.tracking.status import STATUS
+from slamdepth.tracking.wide_features import WideFeatures
 from slamdepth.tracking.workers import DepthWorker, Workers
 from slamdepth.types import Camera, Frame, StepResult, TrackingStatus
-
-_WIDE_FEATURES = 3  # times as many where frames are far apart
-_MOST_FEATURES = 10000
-
-_STATUS = {
-    PlacedBy.MOTION: TrackingStatus.TRACKING,
-    PlacedBy.LAST_KEYFRAME: TrackingStatus.TRACKING,
-    PlacedBy.PLACE: TrackingStatus.RELOCALISED,
-    PlacedBy.REGISTRATION: TrackingStatus.REGISTERED,
-}
 
 
 class Tracker:
@@ -52,23 +45,34 @@ class Tracker:
         depth_model: where the depth of keyframes comes from; None builds the one that
             ``config.depth.name`` names.
         config: settings; None takes the defaults.
+        start_map: a saved map to go on from: the first frames are looked for in it, and where the camera is
+            found the map grows.
 
     Raises:
+        DatasetError: the saved map was made with other features, or with another kind of depth.
         ConfigError: a feature or depth model of that name does not exist.
         WeightsError: the depth model's weights are not there.
     """
 
     def __init__(
-        self, camera: Camera, depth_model: DepthModel | None = None, config: Config | None = None
+        self,
+        camera: Camera,
+        depth_model: DepthModel | None = None,
+        config: Config | None = None,
+        *,
+        start_map: Map | None = None,
     ) -> None:
         self.camera = camera
         self.config = config = config or Config()
         model = metric_model(depth_model, config)
         self._prepare = Preparation(camera, config.features)
-        self._prepare_wide: Preparation | None = None  # made where it is needed first
         self._watch = Stopwatch()
+        self._wide_features = WideFeatures(camera, config.features, self._watch)
         self._workers = Workers(DepthWorker(model, self._watch, with_uncertainty=config.depth.uncertainty))
+        self._earlier: tuple[Session, ...] = ()
         self._atlas = Atlas(self._new_map, config)
+        if start_map is not None:
+            self._go_on_from(start_map, is_measured=is_sensor(model))
         self._steps = 0
         self._last_time_s = -np.inf
         self._finished = False
@@ -77,7 +81,45 @@ class Tracker:
     def _new_map(self, id_: int) -> MapTracker:
         levels = self._prepare.levels
         run = RunParts(self.camera, self.config, levels, self._workers, self._watch, self._wide_features)
-        return MapTracker(id_, run)
+        map_ = MapTracker(id_, run)
+        map_.map.session = len(self._earlier)
+        return map_
+
+    def _go_on_from(self, saved: Map, *, is_measured: bool) -> None:
+        if saved.is_measured != is_measured:
+            kinds = ("a network", "a sensor")
+            raise DatasetError(
+                f"the depth of the map is that of {kinds[saved.is_measured]}, and this run's would be that "
+                f"of {kinds[is_measured]}: lengths would contradict each other; choose with --depth"
+            )
+        load_map(saved, self._active, self.camera, self.config.features)
+        self._earlier = saved.sessions
+
+    @property
+    def is_in_start_map(self) -> bool:
+        """Whether some frame was placed in the map that the run goes on from."""
+        return any(map_.is_loaded and len(map_.frames) > 0 for map_ in self._atlas.maps)
+
+    def is_of_start_map(self, number: int) -> bool:
+        """Whether a map of the finished run holds the one that the run goes on from; 0 is the largest."""
+        return self._atlas.finished[number].is_loaded
+
+    def saved_map(self, number: int, result: Reconstruction, factor: float, info: MapInfo) -> Map:
+        """A map of the finished run as plain data, to be written to disk.
+
+        Args:
+            number: of the map, 0 for the one that :meth:`finish` returned, 1 for the first of its others.
+            result: what was made of it.
+            factor: by which its lengths were multiplied since :meth:`finish`.
+        """
+        tracked = self._atlas.finished[number]
+        if factor != 1.0:
+            tracked.map.rescale(factor)
+        earlier = self._earlier if tracked.is_loaded else ()
+        if not tracked.is_loaded:
+            tracked.map.begin_sessions()
+        kept_s = frozenset(result.trajectory.timestamps_s.tolist())
+        return save_map(tracked, self.camera, self.config.features, earlier, kept_s, info)
 
     @property
     def _active(self) -> MapTracker:
@@ -124,23 +166,13 @@ class Tracker:
         self._steps += 1
         return prepared.features
 
-    def _wide_features(self, frame: Frame) -> Features:
-        """More features of a frame, for a search over a wide baseline."""
-        if self._prepare_wide is None:
-            count = min(_WIDE_FEATURES * self.config.features.count, _MOST_FEATURES)
-            wide = self.config.features.model_copy(update={"count": count})
-            self._prepare_wide = Preparation(self.camera, wide)
-        prepared = self._prepare_wide(frame)
-        self._watch.add("features", prepared.took_ms)
-        return prepared.features
-
     def _result(self, frame: Frame, placed: Placed | None) -> StepResult:
         maps = self._atlas.maps
         missing = TrackingStatus.LOST if self._active.map.keyframes else TrackingStatus.INITIALISING
         return StepResult(
             index=frame.index,
             timestamp_s=frame.timestamp_s,
-            status=missing if placed is None else _STATUS[placed.placed_by],
+            status=missing if placed is None else STATUS[placed.placed_by],
             T_world_camera=None if placed is None else invert(placed.placement.T_camera_world),
             inliers=0 if placed is None else placed.placement.inliers,
             is_keyframe=placed is not None and placed.is_keyframe,
@@ -167,6 +199,8 @@ class Tracker:
         self._workers.between.wait()
         if not self._active.map.keyframes:
             raise TrackingError("no frame could be placed: too few features, or no depth")
+        if not any(len(map_.frames) for map_ in self._atlas.maps):
+            raise TrackingError("no frame could be placed in the map that the run goes on from")
         self._finished = True
         self._watch.next_frame()
         with self, single_threaded():

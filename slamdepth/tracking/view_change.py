@@ -9,6 +9,7 @@ from collections import deque
 import numpy as np
 
 from slamdepth.geometry import transform
+from slamdepth.io.tree import Tree
 from slamdepth.mapping.map_view import MapView
 from slamdepth.typing import Floats, Ints
 
@@ -46,6 +47,15 @@ class ViewChange:
         frames a second lost half of its accuracy (docs/experiments/2026-11-30-prior-where-unbelieved.md).
         """
         return self.is_large and self._map.scale_is_doubted
+
+    def state(self) -> Tree:
+        """Everything it remembers, for a checkpoint."""
+        return {"changes": list(self._changes), "lost": self._lost, "is_large": self.is_large}
+
+    def restore(self, state: Tree) -> None:
+        """Remember what :meth:`state` gave."""
+        self._changes = deque(state["changes"], maxlen=_STEPS)
+        self._lost, self.is_large = state["lost"], state["is_large"]
 
     def measure(self, T_before: Floats, T_now: Floats, landmark_ids: Ints) -> None:
         """Take the step between two frames in a row.

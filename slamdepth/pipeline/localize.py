@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a recording, or one image, is in a saved map."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slamdepth._version import __version__
+from slamdepth.config import Config
+from slamdepth.datasets import open_dataset
+from slamdepth.datasets.image_files import IMAGE_ENDINGS
+from slamdepth.errors import CameraError, DatasetError, ImageDecodeError, OutputError
+from slamdepth.io import write_json, write_text, write_tum_trajectory
+from slamdepth.io.images import read_image_rgb
+from slamdepth.io.trajectory import format_timestamp
+from slamdepth.mapstore import Map
+from slamdepth.pipeline.folder import make_folder
+from slamdepth.pipeline.options import check_frames_asked
+from slamdepth.pipeline.prefetch import FramePrefetcher
+from slamdepth.pipeline.saved_maps import camera_for
+from slamdepth.tracking import MapLocaliser
+from slamdepth.types import Camera, Frame, StepResult, TrackingStatus, Trajectory
+
+logger = logging.getLogger(__name__)
+
+FIGURES = "localized.json"
+_TABLE, _TRAJECTORY = "frames.csv", "trajectory.txt"
+_HEADER = "frame,timestamp_s,status,quality,landmarks,sigma_m,sigma_deg,tx,ty,tz,qx,qy,qz,qw"
+
+Progress = Callable[[int, int, StepResult], None]
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Where frames are in a map.
+
+    Attributes:
+        steps: one result for each frame, in order; withdrawn poses are gone, and their status is LOST.
+        trajectory: the placed frames in the map's world.
+        skipped: images that did not decode.
+        fps: frames a second, reading included.
+        notes: what a reader of the result should know, one line each.
+    """
+
+    steps: tuple[StepResult, ...]
+    trajectory: Trajectory
+    skipped: int
+    fps: float
+    notes: tuple[str, ...]
+
+    @property
+    def placed(self) -> int:
+        """Number of frames with a pose."""
+        return len(self.trajectory)
+
+    def save(self, folder: str | Path) -> None:
+        """Write ``trajectory.txt`` (TUM), ``frames.csv`` with how sure each pose is, and ``localized.json``.
+
+        Raises:
+            OutputError: they cannot be written.
+        """
+        path = Path(folder)
+        make_folder(path)
+        write_tum_trajectory(path / _TRAJECTORY, self.trajectory)
+        write_text(path / _TABLE, "\n".join([_HEADER, *(_row(step) for step in self.steps)]) + "\n")
+        write_json(path / FIGURES, {**self.figures(), "version": __version__})
+
+    def figures(self) -> dict[str, Any]:
+        """Counts for reports."""
+        by_status = {status.value: 0 for status in TrackingStatus}
+        for step in self.steps:
+            by_status[step.status.value] += 1
+        quality = [step.quality for step in self.steps if step.T_world_camera is not None]
+        return {
+            "frames": len(self.steps),
+            "placed": self.placed,
+            "by_status": {name: count for name, count in by_status.items() if count},
+            "median_quality": float(np.median(quality)) if quality else None,
+            "skipped_images": self.skipped,
+            "frames_per_second": self.fps,
+            "notes": list(self.notes),
+        }
+
+
+def localize(
+    map: Map | str | Path,
+    source: str | Path,
+    *,
+    camera: str | Path | None = None,
+    config: Config | None = None,
+    max_frames: int | None = None,
+    stride: int = 1,
+    progress: Progress | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Localisation:
+    """Find where a recording is in a saved map; the map does not change.
+
+    Args:
+        map: or the run folder that has it.
+        source: a video, a folder of images, the folder of a sequence, or one image.
+        camera: a ``camera.yaml``. Default: as the source says; of an image, the map's camera.
+        config: settings; features are those of the map.
+        max_frames: stop after this many frames. Default: all.
+        stride: take every Nth frame.
+        progress: called with frames done, frames in all, and the last result.
+        stop: asked before each frame; True ends with the frames placed so far.
+
+    Raises:
+        InputError: the map, the source or its camera is wrong.
+    """
+    check_frames_asked(stride, max_frames)
+    saved = map if isinstance(map, Map) else Map.load(map)
+    path = Path(source).expanduser()
+    tell = progress or (lambda done, total, result: None)
+    if path.is_file() and path.suffix.lower() in IMAGE_ENDINGS:
+        return _localize_image(saved, path, camera, config)
+    dataset = open_dataset(path, camera)
+    indices = range(0, len(dataset), stride)[:max_frames]
+    used = camera_for(dataset, saved)
+    notes = list(dataset.notes)
+    if used != dataset.camera:
+        notes.append(f"intrinsics are those of the map, since those of the sequence are {_how(dataset)}")
+    start = time.perf_counter()
+    steps: list[StepResult] = []
+    skipped = 0
+    with MapLocaliser(saved, used, config) as localiser:
+        reader = FramePrefetcher(dataset, indices, with_depth=False, prepare=localiser.prepare)
+        with reader:
+            for item in _until(reader, stop):
+                if isinstance(item, ImageDecodeError):
+                    skipped += 1
+                    logger.warning("image skipped: %s", item)
+                    continue
+                frame = item.frame if item.frame.camera == used else replace(item.frame, camera=used)
+                steps.append(localiser.step(frame, item.prepared))
+                tell(len(steps) + skipped, len(indices), steps[-1])
+        trajectory, quality = localiser.trajectory(), localiser.quality()
+    if not steps:
+        raise DatasetError(f"{path}: none of the {len(indices)} images decodes")
+    if len(steps) + skipped < len(indices):
+        notes.append(f"interrupted after {len(steps) + skipped} of {len(indices)} frames")
+    fps = len(steps) / max(1e-9, time.perf_counter() - start)
+    return Localisation(_settled(steps, trajectory, quality), trajectory, skipped, fps, tuple(notes))
+
+
+def _how(dataset: Any) -> str:
+    return f"{dataset.camera_source.certainty.value} ({dataset.camera_source.how})"
+
+
+def _until(reader: FramePrefetcher, stop: Callable[[], bool] | None) -> Iterator[Any]:
+    for item in reader:
+        if stop is not None and stop():
+            return
+        yield item
+
+
+def _settled(
+    steps: list[StepResult], trajectory: Trajectory, quality: NDArray[np.float64]
+) -> tuple[StepResult, ...]:
+    """The results without poses that were withdrawn, and with the quality of those that were confirmed."""
+    sure = dict(zip(trajectory.timestamps_s.tolist(), quality.tolist(), strict=True))
+    lost = {"status": TrackingStatus.LOST, "T_world_camera": None, "quality": 0.0, "covariance": None}
+    settled = []
+    for step in steps:
+        if step.T_world_camera is None:
+            settled.append(step)
+        elif step.timestamp_s in sure:
+            settled.append(replace(step, quality=sure[step.timestamp_s]))
+        else:
+            settled.append(replace(step, inliers=0, **lost))  # type: ignore[arg-type]
+    return tuple(settled)
+
+
+def _localize_image(
+    saved: Map, path: Path, camera_file: str | Path | None, config: Config | None
+) -> Localisation:
+    """One image, by itself."""
+    image_rgb = read_image_rgb(path)
+    height, width = image_rgb.shape[:2]
+    notes: tuple[str, ...] = ()
+    if camera_file is not None:
+        camera = Camera.from_file(Path(camera_file).expanduser())
+    else:
+        theirs = saved.camera
+        if abs(width * theirs.height - height * theirs.width) > max(theirs.width, theirs.height):
+            raise CameraError(
+                f"{path}: is {width}x{height}, and the map's camera {theirs.width}x{theirs.height}: another "
+                "camera; give its intrinsics with --camera FILE"
+            )
+        camera = theirs.scaled(width, height)
+        notes = ("intrinsics are those of the map's camera; --camera FILE gives others",)
+    if (camera.width, camera.height) != (width, height):
+        raise CameraError(
+            f"{path}: is {width}x{height}, and the camera file is for {camera.width}x{camera.height}"
+        )
+    if width > saved.camera.width:
+        import cv2
+
+        camera = camera.scaled(saved.camera.width, round(height * saved.camera.width / width))
+        size = (camera.width, camera.height)
+        image_rgb = np.asarray(cv2.resize(image_rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    start = time.perf_counter()
+    with MapLocaliser(saved, camera, config) as localiser:
+        step = localiser.place(Frame(0, 0.0, image_rgb, camera))
+    found = step.T_world_camera
+    poses = np.zeros((0, 4, 4)) if found is None else found[None]
+    trajectory = Trajectory(np.zeros(len(poses)), poses)
+    return Localisation((step,), trajectory, 0, 1.0 / (time.perf_counter() - start), notes)
+
+
+def _row(step: StepResult) -> str:
+    """A line of ``frames.csv``."""
+    head = f"{step.index},{format_timestamp(step.timestamp_s)},{step.status.value},{step.quality:.3f}"
+    if step.T_world_camera is None:
+        return f"{head},0,,,,,,,,,"
+    from scipy.spatial.transform import Rotation
+
+    sigmas = ["", ""]
+    if step.covariance is not None:
+        variance = step.covariance.diagonal()
+        sigma_deg = np.degrees(np.sqrt(variance[3:].sum()))
+        sigmas = [f"{np.sqrt(variance[:3].sum()):.5f}", f"{sigma_deg:.4f}"]
+    quat_xyzw = Rotation.from_matrix(step.T_world_camera[:3, :3]).as_quat(canonical=True)
+    numbers = [f"{value:.10g}" for value in (*step.T_world_camera[:3, 3].tolist(), *quat_xyzw.tolist())]
+    return ",".join([head, str(step.inliers), *sigmas, *numbers])
+
+
+def plan_folder(output: Path | None, name: str, *, overwrite: bool) -> Path:
+    """Choose and check the folder of the results; nothing is written.
+
+    Raises:
+        OutputError: it is a file, cannot be written, or holds something else than earlier results.
+    """
+    from slamdepth.io import writable
+
+    if output is None:
+        return writable(Path("runs") / f"{name}-localized-{time.strftime('%Y%m%d-%H%M%S')}")
+    path = output.expanduser()
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path}: is a file; name a folder for the results")
+    if path.is_dir() and any(path.iterdir()):
+        if not (path / FIGURES).is_file():
+            raise OutputError(f"{path}: is not empty and holds no earlier localisation; name a new folder")
+        if not overwrite:
+            raise OutputError(f"{path}: holds an earlier localisation; name another or add --overwrite")
+    return writable(path)
