@@ -16,6 +16,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from slamdepth.cli import (
+    batch,
     data_stats,
     depth,
     eval_depth,
@@ -44,6 +45,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("run")(run.run_command)
+app.command("batch")(batch.batch_command)
 app.command("export")(export.export_command)
 app.command("localize")(localize.localize_command)
 app.command("scale")(scale.scale_command)

@@ -101,7 +101,7 @@ class ExportImages:
             px = at_middle_row(pinhole, px, phase, inverse, velocity, self._scene.readout_s)
         px = px - [self._window.left, self._window.top]
         size = [self.camera.width - 0.5, self.camera.height - 0.5]
-        shown: Bools = np.logical_and(px >= -0.5, px < size).all(axis=1)
+        shown = np.asarray(((px >= -0.5) & (px < size)).all(axis=1), np.bool_)
         return px, shown
 
     def project(self, view: View, points_w: Floats) -> tuple[Floats, Bools]:

@@ -192,4 +192,4 @@ def _projected(T_camera_world: Floats, points_w: Floats, K: Floats) -> tuple[Flo
 def _depth(T_camera_world: Floats, points_w: Floats) -> Floats:
     """Depth ``(M,)`` of points in their cameras, positive."""
     z = np.einsum("nj,nj->n", T_camera_world[:, 2, :3], points_w) + T_camera_world[:, 2, 3]
-    return np.maximum(z, 1e-6)
+    return np.asarray(np.maximum(z, 1e-6), np.float64)
