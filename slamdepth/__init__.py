@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage
     from slamdepth.pipeline.export import export_run
     from slamdepth.pipeline.localize import Localisation, localize
+    from slamdepth.pipeline.resume import resume
     from slamdepth.pipeline.run import run
     from slamdepth.tracking import CloudTracker, MapLocaliser, Tracker, create_tracker
     from slamdepth.types import (
@@ -112,6 +113,7 @@ _HOME = {
     "localize": "slamdepth.pipeline.localize",
     "open_dataset": "slamdepth.datasets",
     "read_tum_trajectory": "slamdepth.io",
+    "resume": "slamdepth.pipeline.resume",
     "run": "slamdepth.pipeline.run",
     "score_trajectory": "slamdepth.evaluation",
     "write_tum_trajectory": "slamdepth.io",
@@ -173,6 +175,7 @@ __all__ = [
     "localize",
     "open_dataset",
     "read_tum_trajectory",
+    "resume",
     "run",
     "score_trajectory",
     "write_tum_trajectory",

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from slamdepth.types import Camera
 from slamdepth.typing import Bools, Floats, Ints
 
@@ -71,3 +73,21 @@ class BundleResult:
     iterations: int
     readout_s: float = 0.0
     readout_sigma_s: float | None = None
+
+    @staticmethod
+    def of_readout(readout_s: float, readout_sigma_s: float | None) -> BundleResult:
+        """A result of which only the readout time is remembered."""
+        none = np.zeros(0)
+        return BundleResult(
+            np.zeros((0, 4, 4)),
+            np.zeros((0, 3)),
+            none,
+            np.zeros((0, 3, 3)),
+            np.zeros(0, dtype=np.bool_),
+            none,
+            0.0,
+            0.0,
+            0,
+            readout_s,
+            readout_sigma_s,
+        )

@@ -36,9 +36,13 @@ _PLACES = {
 
 def run_command(
     sequence: Annotated[
-        Path,
-        typer.Argument(metavar="SEQ", help="A video, or the folder of a sequence: TUM layout or 7-Scenes."),
-    ],
+        Path | None,
+        typer.Argument(
+            metavar="SEQ",
+            help="A video, or the folder of a sequence: TUM layout or 7-Scenes.",
+            show_default=False,
+        ),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="DIR", help="Run folder. Default: runs/<sequence>-<time>"),
@@ -163,6 +167,18 @@ def run_command(
     map_images: Annotated[
         bool, typer.Option("--map-images", help="Keep the keyframes' images in the run's map.")
     ] = False,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            "--resume",
+            metavar="RUN",
+            help="Go on with a run that was killed, from its last checkpoint; SEQ only where it was moved.",
+        ),
+    ] = None,
+    checkpoint_every: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="Seconds from one checkpoint to the next; 0: none. Default: 15"),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier run in the output folder.")
     ] = False,
@@ -177,8 +193,19 @@ def run_command(
 
     Example: slamdepth run walk.mp4 --camera camera.yaml --marker tag36h11:0.16
 
+    Example: slamdepth run walk2.mp4 --map runs/walk
+
+    Example: slamdepth run --resume runs/walk
+
     Ctrl-C finishes the run with the frames it has; a second Ctrl-C aborts it.
     """
+    if resume is not None:
+        _resume(resume, sequence, quiet)
+        return
+    if sequence is None:
+        from slamdepth.errors import ConfigError
+
+        raise ConfigError("Missing argument 'SEQ'. Usage: slamdepth run SEQ (see 'slamdepth run --help')")
     settings = _settings(
         config,
         {
@@ -220,9 +247,22 @@ def run_command(
             export=export_names(export),
             start_map=start_map,
             map_images=map_images,
+            checkpoint_s=checkpoint_every,
             progress=lambda step: _show(bar, step),
             stop=stop,
         )
+    _print_result(result, quiet)
+
+
+def _resume(folder: Path, sequence: Path | None, quiet: bool) -> None:
+    """Go on with a run that was killed."""
+    from slamdepth.pipeline.resume import is_finished, resume
+
+    if is_finished(folder):
+        console().print(f"{folder}: the run is finished", markup=False, soft_wrap=True)
+        return
+    with stop_on_signals() as stop, JobBar(quiet) as bar:
+        result = resume(folder, sequence=sequence, progress=lambda step: _show(bar, step), stop=stop)
     _print_result(result, quiet)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from slamdepth.backend.pose_graph import Edge
 from slamdepth.geometry import Similarity, invert, rotation_angle_rad
+from slamdepth.io.tree import Tree
 from slamdepth.loops.look_alikes import FEWEST_DEPTHS, Place, View, depths_in_both, fits_elsewhere
 from slamdepth.mapping.map_keyframe import AnchoredPose, MapKeyframe
 from slamdepth.mapping.map_view import MapView
@@ -53,6 +54,29 @@ class Meeting:
     landmark_ids: Ints
     scale: float
     distance_m: float
+
+    def state(self) -> Tree:
+        """The meeting as plain values, for a checkpoint."""
+        return {
+            "keyframe": self.keyframe.id,
+            "unit": self.unit,
+            "pose": self.pose.state(),
+            "landmark_ids": self.landmark_ids,
+            "scale": self.scale,
+            "distance_m": self.distance_m,
+        }
+
+    @staticmethod
+    def restored(state: Tree, home: MapView, other: MapView) -> Meeting:
+        """What :meth:`state` gave, of a keyframe of ``home``."""
+        return Meeting(
+            home.keyframes[state["keyframe"]],
+            state["unit"],
+            AnchoredPose.restored(state["pose"], other.keyframes),
+            np.array(state["landmark_ids"]),
+            state["scale"],
+            state["distance_m"],
+        )
 
     @property
     def inliers(self) -> int:
@@ -147,6 +171,14 @@ class Meetings:
 
     def __init__(self) -> None:
         self._found: list[Meeting] = []
+
+    def state(self) -> list[Tree]:
+        """All that are remembered, for a checkpoint."""
+        return [meeting.state() for meeting in self._found]
+
+    def restore(self, states: list[Tree], home: MapView, other: MapView) -> None:
+        """Remember what :meth:`state` gave."""
+        self._found = [Meeting.restored(state, home, other) for state in states]
 
     def add(self, meeting: Meeting) -> list[Meeting]:
         """Remember a meeting.

@@ -57,7 +57,7 @@ def encode_sensor_depth(depth_m: NDArray[np.float32], units_per_m: float) -> Enc
 def encode_half_precision(values: NDArray[np.floating]) -> Encoded:
     """Encode ``(H, W)`` rounded to float16, a relative error of at most 0.05 %; the dtype comes back."""
     words = np.ascontiguousarray(values, np.float16).view(np.uint16)
-    return Encoded(_encode_png(words), partial(_decode_half_precision, dtype=values.dtype))
+    return Encoded(_encode_png(words), partial(decode_half_precision, dtype=values.dtype))
 
 
 def _decode_image(data: bytes) -> NDArray[np.uint8]:
@@ -77,7 +77,8 @@ def _decode_float32(data: bytes) -> NDArray[np.float32]:
     return np.asarray(np.stack(halves, axis=-1).view(np.float32)[..., 0], np.float32)
 
 
-def _decode_half_precision(data: bytes, dtype: np.dtype[np.floating]) -> NDArray[np.floating]:
+def decode_half_precision(data: bytes, dtype: np.dtype[np.floating]) -> NDArray[np.floating]:
+    """What :func:`encode_half_precision` was given, as ``dtype``."""
     return _decode_png(data).view(np.float16).astype(dtype)
 
 

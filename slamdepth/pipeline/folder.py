@@ -17,6 +17,7 @@ from slamdepth.errors import OutputError
 from slamdepth.export import is_export
 from slamdepth.io import writable, write_text
 from slamdepth.mapstore import remove_map
+from slamdepth.pipeline import checkpoint
 
 FILES = {
     "trajectory.txt": "every frame placed in the largest map, after optimisation (TUM, camera to world)",
@@ -156,6 +157,7 @@ class RunFolder:
                     shutil.rmtree(folder)
             _remove_if_empty(exports)
         remove_map(self.path / MAP)
+        checkpoint.remove(self.path)
         maps = self.path / MAPS
         if maps.is_symlink() or not maps.is_dir():
             return
@@ -192,14 +194,17 @@ def run_log() -> Iterator[logging.handlers.MemoryHandler]:
             target.close()
 
 
-def write_log_to(buffer: logging.handlers.MemoryHandler, path: Path) -> None:
+def write_log_to(buffer: logging.handlers.MemoryHandler, path: Path, *, goes_on: bool = False) -> None:
     """Write the messages so far and all later ones to ``path``.
+
+    Args:
+        goes_on: behind those of an earlier process.
 
     Raises:
         OutputError: ``path`` cannot be written.
     """
     with writing(path):
-        file = logging.FileHandler(path, mode="w", encoding="utf-8")
+        file = logging.FileHandler(path, mode="a" if goes_on else "w", encoding="utf-8")
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
     buffer.setTarget(file)
     buffer.flush()

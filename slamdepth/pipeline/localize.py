@@ -43,7 +43,7 @@ class Localisation:
     """Where frames are in a map.
 
     Attributes:
-        steps: one result for each frame, in order; withdrawn poses are gone, and their status is LOST.
+        steps: one result for each frame, in order.
         trajectory: the placed frames in the map's world.
         skipped: images that did not decode.
         fps: frames a second, reading included.
@@ -165,17 +165,21 @@ def _until(reader: FramePrefetcher, stop: Callable[[], bool] | None) -> Iterator
 def _settled(
     steps: list[StepResult], trajectory: Trajectory, quality: NDArray[np.float64]
 ) -> tuple[StepResult, ...]:
-    """The results without poses that were withdrawn, and with the quality of those that were confirmed."""
-    sure = dict(zip(trajectory.timestamps_s.tolist(), quality.tolist(), strict=True))
-    lost = {"status": TrackingStatus.LOST, "T_world_camera": None, "quality": 0.0, "covariance": None}
+    """The results with poses that later frames confirmed, and without those that they contradicted."""
+    poses = zip(trajectory.T_world_camera, quality.tolist(), strict=True)
+    found = dict(zip(trajectory.timestamps_s.tolist(), poses, strict=True))
     settled = []
     for step in steps:
-        if step.T_world_camera is None:
-            settled.append(step)
-        elif step.timestamp_s in sure:
-            settled.append(replace(step, quality=sure[step.timestamp_s]))
-        else:
-            settled.append(replace(step, inliers=0, **lost))  # type: ignore[arg-type]
+        if step.timestamp_s not in found:
+            step = replace(
+                step, status=TrackingStatus.LOST, T_world_camera=None, inliers=0, quality=0.0, covariance=None
+            )
+        elif step.T_world_camera is None:
+            T_world_camera, sure = found[step.timestamp_s]
+            step = replace(
+                step, status=TrackingStatus.RELOCALISED, T_world_camera=T_world_camera, quality=sure
+            )
+        settled.append(step)
     return tuple(settled)
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -12,6 +13,9 @@ from typing import Any
 from slamdepth.errors import ConfigError, SlamdepthError
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.types import TrackingStatus, Trajectory
+
+CHECKPOINT_S = 15.0
+"""Seconds from one checkpoint of a run to the next."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,7 @@ class RunOptions:
         overwrite: an earlier run in ``output`` may be replaced.
         start_map: a run whose map this run goes on from.
         map_images: keep images in the map.
+        checkpoint_s: seconds from one checkpoint to the next; 0 writes none.
         exports: formats that the result is exported to, see :func:`slamdepth.export_run`.
 
     Raises:
@@ -43,10 +48,13 @@ class RunOptions:
     overwrite: bool = False
     start_map: Path | None = None
     map_images: bool = False
+    checkpoint_s: float = CHECKPOINT_S
     exports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_frames_asked(self.stride, self.max_frames)
+        if not 0.0 <= self.checkpoint_s < math.inf:
+            raise ConfigError(f"checkpoints must be 0 or more seconds apart, got {self.checkpoint_s:g}")
 
     def indices(self, frames: int) -> range:
         """Which of ``frames`` frames are read, in order."""

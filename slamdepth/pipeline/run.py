@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from logging.handlers import MemoryHandler
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from slamdepth.frontend.features import feature_weights
 from slamdepth.io import write_text
 from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapstore import Map, Session
+from slamdepth.pipeline import checkpoint
+from slamdepth.pipeline.checkpoint import Checkpoints, Latest, SequenceKeyframes, begin
 from slamdepth.pipeline.dense import measure_depth
 from slamdepth.pipeline.export import check_exports, export_results
 from slamdepth.pipeline.folder import (
@@ -41,6 +44,7 @@ from slamdepth.pipeline.folder import (
 )
 from slamdepth.pipeline.maps import finish_others, settle_others, write_mesh, write_trajectories
 from slamdepth.pipeline.options import (
+    CHECKPOINT_S,
     ProgressCallback,
     RunOptions,
     RunProgress,
@@ -58,6 +62,7 @@ from slamdepth.pipeline.scale import settle_scale
 from slamdepth.pipeline.surface import score_mesh
 from slamdepth.pipeline.tracking import AnyTracker, Tracked, track
 from slamdepth.report import MeshCounts, MeshImage, ReportData, render_errors, write_report
+from slamdepth.tracking import Tracker
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +80,7 @@ def run(
     overwrite: bool = False,
     start_map: str | Path | None = None,
     map_images: bool = False,
+    checkpoint_s: float | None = None,
     export: Sequence[str] = (),
     progress: ProgressCallback | None = None,
     stop: threading.Event | None = None,
@@ -97,6 +103,8 @@ def run(
         overwrite: an earlier run in ``output`` may be replaced.
         start_map: a run folder (or the ``map`` in it) whose map this run goes on from and extends.
         map_images: keep the keyframes' images in ``map/``.
+        checkpoint_s: seconds from one checkpoint to the next, see :func:`slamdepth.resume`; 0 writes none.
+            Default: 15.
         export: formats to export the result to, into ``export/`` of the run folder; see :func:`export_run`.
         progress: called after each frame and at the start of each stage.
         stop: set it, from any thread or a signal handler, to finish early with the frames tracked so far.
@@ -120,16 +128,46 @@ def run(
         overwrite,
         None if start_map is None else Path(start_map),
         map_images,
+        CHECKPOINT_S if checkpoint_s is None else checkpoint_s,
         tuple(export),
     )
-    settings = _settings(config, depth)
+    return run_job(options, _settings(config, depth), progress, stop)
+
+
+def run_job(
+    options: RunOptions,
+    config: Config,
+    progress: ProgressCallback | None = None,
+    stop: threading.Event | None = None,
+    begun: Begun | None = None,
+) -> RunResult:
+    """Do a run from its start, or from where an earlier process left it.
+
+    Args:
+        begun: what that process left in the run folder ``options.output``.
+    """
     tell = progress or (lambda state: None)
     stopped = stop or threading.Event()
     with run_log() as log:
-        job = _prepare(options, settings, tell, stopped)
+        job = _prepare(options, config, tell, stopped, begun)
         with job.tracker:
             tracked = _track(job, log, tell, stopped)
-        return _finish(job, tracked, tell)
+        result = _finish(job, tracked, tell)
+        checkpoint.remove(result.folder)
+        return result
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A run that was killed.
+
+    Attributes:
+        sequence: what is known of its sequence.
+        latest: its latest checkpoint; None where there is none.
+    """
+
+    sequence: dict[str, Any]
+    latest: Latest | None
 
 
 @dataclass(frozen=True)
@@ -138,6 +176,7 @@ class _Job:
 
     Attributes:
         indices: which frames of the dataset are tracked.
+        latest: the checkpoint that the run goes on from.
         model: the depth model as the tracker gets it, scaled where that was asked for.
     """
 
@@ -150,6 +189,7 @@ class _Job:
     scale: PredictionScale
     tracker: AnyTracker
     start_map: Map | None = None
+    latest: Latest | None = None
 
     @property
     def depth_is_measured(self) -> bool:
@@ -165,7 +205,13 @@ def _settings(config: Config | str | Path | None, depth: str | None) -> Config:
     return Config.from_dict(merge(config.model_dump(), {"depth": {"name": depth}}))
 
 
-def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: threading.Event) -> _Job:
+def _prepare(
+    options: RunOptions,
+    config: Config,
+    tell: ProgressCallback,
+    stop: threading.Event,
+    begun: Begun | None,
+) -> _Job:
     """Open and check everything that a run needs, what costs least first."""
     from slamdepth.tracking import create_tracker
 
@@ -175,7 +221,13 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     dataset = open_dataset(options.sequence, options.camera_file)
     indices = options.indices(len(dataset))
     check_scale_options(dataset, config, indices)
-    folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite)
+    if begun is not None and describe(dataset) != begun.sequence:
+        raise DatasetError(
+            f"{dataset.path}: is not the sequence that the run was tracking; name that one, or start the run "
+            "again with --overwrite"
+        )
+    is_new = begun is None
+    folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite or not is_new)
     seed_everything(config.seed)
     given = configured_model(config)
     if is_sensor(given):
@@ -195,15 +247,38 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     model = scale.applied_to(given)
     seed_torch(config.seed)
     tracker = create_tracker(dataset.camera, depth_model=model, config=config, start_map=start_map)
-    return _Job(options, config, dataset, indices, folder, model, scale, tracker, start_map)
+    latest = None if begun is None else begun.latest
+    if latest is not None and isinstance(tracker, Tracker):
+        stored = SequenceKeyframes(dataset, folder.path, latest, with_depth=is_sensor(model))
+        tracker.restore(latest.tracker, stored.read_frame, stored.read_prediction)
+    return _Job(options, config, dataset, indices, folder, model, scale, tracker, start_map, latest)
+
+
+def describe(dataset: Dataset) -> dict[str, Any]:
+    """What tells two sequences apart, as far as it is known without reading their images."""
+    times_s = dataset.timestamps_s
+    return {
+        "frames": len(dataset),
+        "first_s": float(times_s[0]),
+        "last_s": float(times_s[-1]),
+        "size": [dataset.camera.width, dataset.camera.height],
+        "K": dataset.camera.K.ravel().tolist(),
+    }
 
 
 def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threading.Event) -> Tracked:
     """Make the run folder and feed the tracker; bad images leave no folder behind."""
     config, dataset, folder = job.config, job.dataset, job.folder
-    folder.create(_arguments(job.options))
+    latest = job.latest
+    if latest is None:
+        folder.create(_arguments(job.options))
+        begin(folder.path, begun_run(job.options, config, dataset))
+    checkpoints = Checkpoints(folder.path, job.options.checkpoint_s)
     try:
-        write_log_to(log, folder / "log.txt")
+        write_log_to(log, folder / "log.txt", goes_on=latest is not None)
+        if latest is not None:
+            checkpoints.go_on_from(latest)
+            logger.info("going on from the checkpoint after %d frames", latest.progress.done)
         write_text(folder / "config.yaml", _settings_text(job.options, config))
         if job.scale.fit is not None:
             write_scale(folder / "depth_scale.yaml", job.scale.fit)
@@ -223,14 +298,33 @@ def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threadin
             with_depth=job.depth_is_measured,
             progress=tell,
             stop=stop,
+            checkpoints=checkpoints,
+            before=None if latest is None else latest.progress,
         )
     except SlamdepthError as error:
-        if not isinstance(error, OutputError):  # of a full disk, say, what is there is worth keeping
+        # of a full disk, say, what is there is worth keeping, and so is what a killed run left
+        if not isinstance(error, OutputError) and latest is None:
             folder.discard()
         raise
     except BaseException:
         logger.debug("the run broke off", exc_info=True)
         raise
+    finally:
+        checkpoints.close()
+
+
+def begun_run(options: RunOptions, config: Config, dataset: Dataset) -> dict[str, Any]:
+    """What it takes to do a run again."""
+    asked = asdict(options)
+    paths = ("sequence", "camera_file", "start_map")
+    return {
+        "options": {
+            **{name: value for name, value in asked.items() if name not in (*paths, "output", "overwrite")},
+            **{name: None if asked[name] is None else str(Path(asked[name]).absolute()) for name in paths},
+        },
+        "config": config.model_dump(mode="json"),
+        "sequence": describe(dataset),
+    }
 
 
 def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
@@ -360,7 +454,7 @@ def seed_torch(seed: int) -> None:
 def _reported_options(options: RunOptions, tracked: Tracked) -> dict[str, object]:
     """The options without paths: a report is passed on, folders of a machine are not."""
     asked = asdict(options)
-    for name in ("sequence", "output", "overwrite", "camera_file", "start_map"):
+    for name in ("sequence", "output", "overwrite", "camera_file", "start_map", "checkpoint_s"):
         asked.pop(name)
     return {
         **asked,

@@ -7,6 +7,8 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 
+import numpy as np
+
 from slamdepth.datasets import Dataset
 from slamdepth.datasets.intrinsics import Certainty
 from slamdepth.mapping.reconstruction import Reconstruction
@@ -15,7 +17,7 @@ from slamdepth.pipeline.folder import MAP, RunFolder
 from slamdepth.pipeline.tracking import AnyTracker
 from slamdepth.report import ScaleFacts, ScaleSource
 from slamdepth.tracking import Tracker
-from slamdepth.tracking.saved_maps import MapInfo, same_lens
+from slamdepth.tracking.saved_maps import same_lens
 from slamdepth.types import Camera
 
 logger = logging.getLogger(__name__)
@@ -90,13 +92,20 @@ def write_maps(
     if not isinstance(tracker, Tracker):
         return
     for number, (before, after, scale) in enumerate(zip(tracked, settled, scales, strict=True)):
-        info = MapInfo(session, asdict(scale), with_images)
-        saved = tracker.saved_map(number, after, _factor(before, after), info)
+        saved = tracker.saved_map(
+            number,
+            after,
+            session,
+            asdict(scale),
+            factor=_factor(before, after),
+            with_images=with_images,
+        )
         saved.save(folder.make_map_folder(number + 1) / MAP)
 
 
 def _factor(before: Reconstruction, after: Reconstruction) -> float:
     """By which the lengths of a map were multiplied."""
     if not before.keyframes or not after.keyframes:
-        return 1.0
+        was, now = (float(np.abs(one.points_m).sum()) for one in (before, after))
+        return now / was if was > 0 else 1.0
     return after.keyframes[0].depth_scale / before.keyframes[0].depth_scale

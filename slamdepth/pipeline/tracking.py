@@ -16,8 +16,10 @@ from slamdepth.datasets import Dataset
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import TrajectoryWriter
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.pipeline.checkpoint import Checkpoints, Progress
 from slamdepth.pipeline.options import ProgressCallback, RunInterrupted, RunProgress, RunStage
 from slamdepth.pipeline.prefetch import FramePrefetcher
+from slamdepth.tracking import Tracker
 from slamdepth.types import Frame, StepResult
 
 logger = logging.getLogger(__name__)
@@ -70,8 +72,14 @@ def track(
     with_depth: bool,
     progress: ProgressCallback,
     stop: threading.Event,
+    checkpoints: Checkpoints | None = None,
+    before: Progress | None = None,
 ) -> Tracked:
     """Feed the frames to ``tracker`` until the last one or until ``stop`` is set, and finish it.
+
+    Args:
+        checkpoints: writes them.
+        before: what was done before the run was killed; the tracker has its state.
 
     Raises:
         DatasetError: more than half of the images do not decode.
@@ -79,62 +87,123 @@ def track(
         RunInterrupted: ``stop`` was set before the first frame.
         OutputError: ``online_path`` cannot be written.
     """
-    steps: list[StepResult] = []
-    skipped = 0
-    map_id = 0
-    start_s: float | None = None
-    total = len(indices)
-    reader = FramePrefetcher(dataset, indices, with_depth=with_depth, prepare=tracker.prepare)
-    progress(RunProgress(RunStage.TRACKING, 0, total))
-    with reader, TrajectoryWriter(online_path) as online:
+    before = before or Progress()
+    left = indices[len(indices) if before.is_complete else before.done :]
+    reader = FramePrefetcher(dataset, left, with_depth=with_depth, prepare=tracker.prepare)
+    run = _Run(reader, len(indices), before)
+    progress(RunProgress(RunStage.TRACKING, before.done, run.total))
+    with reader, TrajectoryWriter(online_path) as writer:
+        online = _Online(writer)
+        for step in run.steps:
+            online.add(step)
         for item in reader:
             if stop.is_set():
                 break
             if isinstance(item, ImageDecodeError):
-                skipped += 1
-                _warn(item, skipped)
-                if 2 * skipped > total:
-                    raise DatasetError(
-                        f"{dataset.path}: more than half of the images do not decode "
-                        f"({skipped} of the first {skipped + len(steps)}); the last: {item}"
-                    )
+                run.skip(item, dataset)
                 continue
-            if start_s is None:
-                start_s = time.perf_counter()
+            run.start()
             result = tracker.step(item.frame, item.prepared)
-            steps.append(result)
-            if result.T_world_camera is not None:
-                if result.map_id != map_id:
-                    map_id = result.map_id
-                    online.comment(
-                        f"from here on in the world frame of map {map_id + 1}, as maps were started"
-                    )
-                online.append(result.timestamp_s, result.T_world_camera)
-            progress(_state(result, len(steps) + skipped, total, len(steps), start_s))
-    if start_s is None:
+            run.steps.append(result)
+            online.add(result)
+            if checkpoints is not None and checkpoints.is_due and isinstance(tracker, Tracker):
+                _checkpoint(tracker, checkpoints, run)
+            progress(run.state(result))
+    if not run.steps:
         if stop.is_set():
             raise RunInterrupted("interrupted before the first frame; nothing was saved")
-        raise DatasetError(f"{dataset.path}: none of the {total} images decodes")
+        raise DatasetError(f"{dataset.path}: none of the {run.total} images decodes")
+    progress(replace(run.state(run.steps[-1]), stage=RunStage.OPTIMISING))
+    if checkpoints is not None and isinstance(tracker, Tracker):
+        tracker.complete()
+        checkpoints.write(tracker, lambda: run.so_far(is_complete=True))
+    return _finished(tracker, run)
 
-    done = len(steps) + skipped
-    state = _state(steps[-1], done, total, len(steps), start_s)
-    progress(replace(state, stage=RunStage.OPTIMISING))
+
+class _Run:
+    """The frames of a run so far."""
+
+    def __init__(self, reader: FramePrefetcher, total: int, before: Progress) -> None:
+        self.reader = reader
+        self.total = total
+        self.steps = list(before.steps)
+        self.skipped = before.skipped
+        self.start_s: float | None = time.perf_counter() - before.elapsed_s if before.steps else None
+        reader.read_s, reader.broken_depth_images = before.read_s, before.broken_depth_images
+
+    @property
+    def done(self) -> int:
+        return len(self.steps) + self.skipped
+
+    def start(self) -> None:
+        """The first frame is there."""
+        if self.start_s is None:
+            self.start_s = time.perf_counter()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Since the first frame."""
+        return 0.0 if self.start_s is None else time.perf_counter() - self.start_s
+
+    def skip(self, error: ImageDecodeError, dataset: Dataset) -> None:
+        """Count an image that cannot be read; refuse the sequence where half of them cannot."""
+        self.skipped += 1
+        _warn(error, self.skipped)
+        if 2 * self.skipped > self.total:
+            raise DatasetError(
+                f"{dataset.path}: more than half of the images do not decode "
+                f"({self.skipped} of the first {self.done}); the last: {error}"
+            )
+
+    def so_far(self, *, is_complete: bool = False) -> Progress:
+        """For a checkpoint."""
+        return Progress(
+            tuple(self.steps),
+            self.skipped,
+            self.reader.broken_depth_images,
+            self.reader.read_s,
+            self.elapsed_s,
+            is_complete,
+        )
+
+    def state(self, result: StepResult) -> RunProgress:
+        """For the progress bar."""
+        return RunProgress(
+            RunStage.TRACKING,
+            self.done,
+            self.total,
+            len(self.steps) / max(1e-9, self.elapsed_s),
+            result.status,
+            result.keyframes,
+            result.loop_closures,
+        )
+
+    def notes(self) -> list[str]:
+        """What a reader of the result should know."""
+        notes: list[str] = []
+        if self.done < self.total:
+            notes.append(f"interrupted after {self.done} of {self.total} frames")
+        if self.skipped:
+            notes.append(
+                f"{self.skipped} of {self.total} images do not decode or are missing, and were skipped"
+            )
+        if self.reader.broken_depth_images:
+            notes.append(f"{self.reader.broken_depth_images} depth images do not decode and were left out")
+        return notes
+
+
+def _finished(tracker: AnyTracker, run: _Run) -> Tracked:
+    """Finish the tracker."""
     finish_s = time.perf_counter()
     reconstruction = tracker.finish()
     statistics = reconstruction.statistics
-    end_s = time.perf_counter()
+    frames = len(run.steps)
     timings_ms = {
         **statistics.timings_ms,
-        "finish": 1e3 * (end_s - finish_s),
-        "decode": 1e3 * reader.read_s / max(1, len(steps)),
+        "finish": 1e3 * (time.perf_counter() - finish_s),
+        "decode": 1e3 * run.reader.read_s / max(1, frames),
     }
-    notes: list[str] = []
-    if done < total:
-        notes.append(f"interrupted after {done} of {total} frames")
-    if skipped:
-        notes.append(f"{skipped} of {total} images do not decode or are missing, and were skipped")
-    if reader.broken_depth_images:
-        notes.append(f"{reader.broken_depth_images} depth images do not decode and were left out")
+    notes = run.notes()
     for note in notes:
         logger.warning("%s", note)
     return Tracked(
@@ -143,15 +212,40 @@ def track(
             statistics=replace(
                 statistics,
                 timings_ms=timings_ms,
-                timing_calls={**statistics.timing_calls, "finish": 1, "decode": len(steps)},
+                timing_calls={**statistics.timing_calls, "finish": 1, "decode": frames},
             ),
         ),
-        tuple(steps),
-        len(steps) / (end_s - start_s),
-        skipped,
-        done < total,
+        tuple(run.steps),
+        frames / run.elapsed_s,
+        run.skipped,
+        run.done < run.total,
         tuple(notes),
     )
+
+
+class _Online:
+    """The growing trajectory file."""
+
+    def __init__(self, file: TrajectoryWriter) -> None:
+        self._file = file
+        self._map_id = 0
+
+    def add(self, result: StepResult) -> None:
+        """Append a frame's pose, if it has one."""
+        if result.T_world_camera is None:
+            return
+        if result.map_id != self._map_id:
+            self._map_id = result.map_id
+            self._file.comment(
+                f"from here on in the world frame of map {self._map_id + 1}, as maps were started"
+            )
+        self._file.append(result.timestamp_s, result.T_world_camera)
+
+
+def _checkpoint(tracker: Tracker, checkpoints: Checkpoints, run: _Run) -> None:
+    """Write a checkpoint, unless a keyframe waits; then one of the next frames will."""
+    if tracker.is_quiet:
+        checkpoints.write(tracker, run.so_far)
 
 
 def _warn(error: ImageDecodeError, count: int) -> None:
@@ -159,15 +253,3 @@ def _warn(error: ImageDecodeError, count: int) -> None:
     if count == _WARNINGS + 1:
         logger.warning("further images that cannot be read are only counted")
     logger.log(level, "image skipped: %s", error)
-
-
-def _state(result: StepResult, done: int, total: int, frames: int, start_s: float) -> RunProgress:
-    return RunProgress(
-        RunStage.TRACKING,
-        done,
-        total,
-        frames / max(1e-9, time.perf_counter() - start_s),
-        result.status,
-        result.keyframes,
-        result.loop_closures,
-    )

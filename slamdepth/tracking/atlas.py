@@ -14,9 +14,11 @@ from functools import partial
 
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features
+from slamdepth.io.tree import Tree
 from slamdepth.loops.look_alikes import View, fits
 from slamdepth.loops.meeting import Meeting, Meetings, find_meeting
 from slamdepth.mapping.map_keyframe import MapKeyframe
+from slamdepth.tracking.map_parts import StoredKeyframes
 from slamdepth.tracking.map_tracker import FEWEST_FRAMES, MapTracker, Placed
 from slamdepth.types import Frame
 
@@ -73,6 +75,40 @@ class Atlas:
         if self.active.is_worth_keeping:
             self._failed = 0
         return placed
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether all maps wait for nothing, so that :meth:`state` is all there is to know."""
+        return bool(self.active.map.keyframes) and all(map_.integration.is_quiet for map_ in self.maps)
+
+    def state(self) -> Tree:
+        """Everything the maps remember, for a checkpoint; they must be quiet."""
+        by_id = {map_.id: map_ for map_ in self.maps}
+        return {
+            "maps": [map_.state() for map_ in self.maps],
+            "active": self.maps.index(self.active),
+            "counts": [self.joined, self.dropped_frames, self._started, self._failed],
+            "lost_since_s": self._lost_since_s,
+            "meetings": {str(k): found.state() for k, found in self._meetings.items() if k in by_id},
+        }
+
+    def restore(self, state: Tree, stored: StoredKeyframes) -> None:
+        """Go on from what :meth:`state` gave.
+
+        Args:
+            stored: reads images and predictions.
+        """
+        self.maps = []
+        for one in state["maps"]:
+            map_ = self._new(one["id"])
+            map_.restore(one, stored)
+            self.maps.append(map_)
+        self.active = self.maps[state["active"]]
+        self.joined, self.dropped_frames, self._started, self._failed = state["counts"]
+        self._lost_since_s = state["lost_since_s"]
+        by_id = {map_.id: map_ for map_ in self.maps}
+        for k, found in state["meetings"].items():
+            self._meetings[int(k)].restore(found, self.active.map, by_id[int(k)].map)
 
     def _find(self, frame: Frame, raw: Features) -> Placed | None:
         """Look for the place of a lost frame in the other maps."""

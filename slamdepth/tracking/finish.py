@@ -49,7 +49,7 @@ class FinalMap:
 
 
 def finish_run(atlas: Atlas, config: Config, watch: Stopwatch, steps: int) -> Reconstruction:
-    """Finish all maps of a run that are kept.
+    """Finish all maps of a run that are kept; no keyframe waits.
 
     Args:
         steps: frames given to the tracker.
@@ -57,8 +57,6 @@ def finish_run(atlas: Atlas, config: Config, watch: Stopwatch, steps: int) -> Re
     Returns:
         The largest map, with the others that never met it.
     """
-    atlas.active.integration.run_all()
-    atlas.meet()
     kept = atlas.by_size()
     atlas.finished = tuple(kept)
     atlas.active = kept[0]

@@ -91,13 +91,15 @@ class KeyframeIntegration:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether no keyframe waits and no thread computes anything that the map will take over."""
-        return not self._waiting and self._readout is None and not self._is_adjusting
+        """Whether no keyframe waits, so that :meth:`state` is all there is to know."""
+        return not self._waiting and not self._is_adjusting
 
     def state(self) -> Tree:
         """Everything it remembers, for a checkpoint; it must be quiet."""
         assert self.is_quiet
+        readout = None if self._readout is None else self._readout.result()
         return {
+            "readout": None if readout is None else [readout.readout_s, readout.readout_sigma_s],
             "loops": self.loops.state(),
             "policy": self._policy.state(),
             "gravity": self.gravity.state(),
@@ -112,6 +114,9 @@ class KeyframeIntegration:
         self.gravity.restore(state["gravity"])
         self._complete = [self._map.keyframes[k] for k in state["complete"]]
         self.mapper.dropped = state["dropped"]
+        if state["readout"] is not None:
+            self._readout = Future()
+            self._readout.set_result(BundleResult.of_readout(*state["readout"]))
 
     def wants(self, placement: Placement) -> bool:
         """Whether a frame should become a keyframe; see :class:`KeyframePolicy`."""

@@ -88,8 +88,8 @@ class MapLocaliser:
             prepared: what :meth:`prepare` gave for it; None prepares it here.
 
         Returns:
-            Its pose in the map, None where it was not found. ``quality`` is 0 as long as the frames that
-            follow have to confirm the pose; where they do not, :meth:`trajectory` leaves it out.
+            Its pose in the map. None where it was not found, and where the frames that follow have to
+            confirm it first: once they do, :meth:`trajectory` has it.
 
         Raises:
             TrackingError: the localiser was closed, or time does not increase.
@@ -99,7 +99,7 @@ class MapLocaliser:
         with single_threaded():
             placed = self._map.track(frame, self._features(frame, prepared))
         self._last_time_s = self._map.motion.last_time_s = frame.timestamp_s
-        return self._result(frame, placed, is_sure=not self._map.check.is_provisional)
+        return self._result(frame, None if self._map.check.is_provisional else placed)
 
     def place(self, frame: Frame) -> StepResult:
         """Place a single image, whatever was placed before; the next :meth:`step` starts anew.
@@ -114,7 +114,7 @@ class MapLocaliser:
         check_frame(frame, self.camera, -np.inf, self._closed)
         with single_threaded():
             placed = self._map.place_alone(frame, self._features(frame, None))
-        return self._result(frame, placed, is_sure=True)
+        return self._result(frame, placed)
 
     def trajectory(self) -> Trajectory:
         """The frames given to :meth:`step` that were placed and not withdrawn, in the map's world."""
@@ -130,7 +130,7 @@ class MapLocaliser:
         self._watch.add("features", prepared.took_ms)
         return prepared.features
 
-    def _result(self, frame: Frame, placed: Placed | None, *, is_sure: bool) -> StepResult:
+    def _result(self, frame: Frame, placed: Placed | None) -> StepResult:
         keyframes = len(self._map.map.keyframes)
         if placed is None:
             return StepResult(
@@ -150,7 +150,7 @@ class MapLocaliser:
             keyframes=keyframes,
             timings_ms=self._watch.frame_ms,
             covariance=placed.covariance,
-            quality=placed.quality if is_sure else 0.0,
+            quality=placed.quality,
             moving_share=placed.moving_share,
         )
 

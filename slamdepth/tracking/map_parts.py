@@ -6,22 +6,34 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from slamdepth.config import Config
 from slamdepth.frontend.features import Features, ScaleLevels
+from slamdepth.io.tree import Tree
+from slamdepth.mapping.keyframe_store import StoredFrame
 from slamdepth.mapping.map import Map
 from slamdepth.mapping.placement import PlacedBy
 from slamdepth.stopwatch import Stopwatch
 from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.integration import KeyframeIntegration
 from slamdepth.tracking.localiser import Localiser
+from slamdepth.tracking.map_arrays import (
+    keyframe_arrays,
+    keyframe_states,
+    landmark_arrays,
+    landmarks_of,
+    metric_of,
+    metric_state,
+)
 from slamdepth.tracking.motion import MotionModel
 from slamdepth.tracking.past_frames import PastFrames
 from slamdepth.tracking.pose_check import PoseCheck
 from slamdepth.tracking.relocaliser import Relocaliser
 from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.tracking.workers import Workers
-from slamdepth.types import Camera, Frame
+from slamdepth.types import Camera, DepthPrediction, Frame
+from slamdepth.typing import Floats
 
 
 @dataclass(frozen=True)
@@ -45,6 +57,19 @@ class RunParts:
     watch: Stopwatch
     wide_features: Callable[[Frame], Features]
     grows_maps: bool = True
+
+
+@dataclass(frozen=True)
+class StoredKeyframes:
+    """Reads images and predictions of keyframes that an earlier process made.
+
+    Attributes:
+        read_frame: reads a frame of the sequence by its index.
+        read_prediction: reads the prediction that was made for a frame.
+    """
+
+    read_frame: Callable[[int], Frame]
+    read_prediction: Callable[[StoredFrame], DepthPrediction]
 
 
 class MapParts:
@@ -94,3 +119,56 @@ class MapParts:
         self.placed_by: Counter[PlacedBy] = Counter()
         self.past = PastFrames()
         self.is_loaded = False
+
+    def state(self) -> Tree:
+        """Everything the map and its parts remember, for a checkpoint; no keyframe waits."""
+        map_ = self.map
+        return {
+            "id": self.id,
+            "is_loaded": self.is_loaded,
+            "placed_by": {placed_by.name: count for placed_by, count in self.placed_by.items()},
+            "metric": metric_state(map_.keyframes[0].features.metric),
+            "keyframes": keyframe_arrays(map_.keyframes),
+            "landmarks": landmark_arrays(map_.landmarks),
+            "map": {"starts": sorted(map_.starts), "session": map_.session, "compact_at": map_.compact_at},
+            "past": self.past.arrays(),
+            "frames": self.frames.state(),
+            "motion": self.motion.state(),
+            "shutter": self.shutter.state(),
+            "check": self.check.state(),
+            "view_change": self.view_change.state(),
+            "integration": self.integration.state(),
+            "relocaliser": self.relocaliser.state(),
+        }
+
+    def restore(self, state: Tree, stored: StoredKeyframes) -> None:
+        """Fill an empty map with what :meth:`state` gave.
+
+        Args:
+            stored: reads images and predictions.
+        """
+        session = state["map"]["session"]
+        sessions = state["keyframes"]["session"]
+
+        def read(number: int, frame: StoredFrame) -> Callable[[], DepthPrediction] | None:
+            return partial(stored.read_prediction, frame) if sessions[number] == session else None
+
+        def frame_of(number: int, index: int, timestamp_s: float, gravity: Floats | None) -> StoredFrame:
+            reader = partial(stored.read_frame, index) if sessions[number] == session else None
+            return StoredFrame.of_saved(index, timestamp_s, self._run.camera, gravity, reader)
+
+        states = keyframe_states(state["keyframes"], metric_of(state["metric"]), frame_of, read)
+        about = state["map"]
+        self.map.restore(states, landmarks_of(state["landmarks"]), about["starts"], about["compact_at"])
+        self.map.session = session
+        keyframes = self.map.keyframes
+        self.id, self.is_loaded = state["id"], state["is_loaded"]
+        self.placed_by = Counter({PlacedBy[name]: count for name, count in state["placed_by"].items()})
+        self.past.restore(state["past"], keyframes)
+        self.frames.restore(state["frames"])
+        self.motion.restore(state["motion"], keyframes)
+        self.shutter.restore(state["shutter"])
+        self.check.restore(state["check"])
+        self.view_change.restore(state["view_change"])
+        self.integration.restore(state["integration"])
+        self.relocaliser.restore(state["relocaliser"])

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +18,8 @@ from slamdepth.frontend.compiled import load
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.preparation import Preparation, Prepared
 from slamdepth.geometry import invert
+from slamdepth.io.tree import Tree
+from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapstore import Map, Session
 from slamdepth.stopwatch import Stopwatch
@@ -22,13 +27,13 @@ from slamdepth.thread_limits import single_threaded
 from slamdepth.tracking.atlas import Atlas
 from slamdepth.tracking.finish import finish_run
 from slamdepth.tracking.frame_log import check_frame
-from slamdepth.tracking.map_parts import RunParts
+from slamdepth.tracking.map_parts import RunParts, StoredKeyframes
 from slamdepth.tracking.map_tracker import MapTracker, Placed
 from slamdepth.tracking.saved_maps import MapInfo, load_map, save_map
 from slamdepth.tracking.status import STATUS
 from slamdepth.tracking.wide_features import WideFeatures
 from slamdepth.tracking.workers import DepthWorker, Workers
-from slamdepth.types import Camera, Frame, StepResult, TrackingStatus
+from slamdepth.types import Camera, DepthPrediction, Frame, StepResult, TrackingStatus
 
 
 class Tracker:
@@ -76,6 +81,7 @@ class Tracker:
         self._steps = 0
         self._last_time_s = -np.inf
         self._finished = False
+        self._is_complete = False
         _load_libraries()
 
     def _new_map(self, id_: int) -> MapTracker:
@@ -104,13 +110,25 @@ class Tracker:
         """Whether a map of the finished run holds the one that the run goes on from; 0 is the largest."""
         return self._atlas.finished[number].is_loaded
 
-    def saved_map(self, number: int, result: Reconstruction, factor: float, info: MapInfo) -> Map:
+    def saved_map(
+        self,
+        number: int,
+        result: Reconstruction,
+        session: Session,
+        scale: Mapping[str, Any],
+        *,
+        factor: float = 1.0,
+        with_images: bool = False,
+    ) -> Map:
         """A map of the finished run as plain data, to be written to disk.
 
         Args:
             number: of the map, 0 for the one that :meth:`finish` returned, 1 for the first of its others.
             result: what was made of it.
+            session: the recording that was tracked.
+            scale: what is known of the scale, as in ``report.json``.
             factor: by which its lengths were multiplied since :meth:`finish`.
+            with_images: keep the keyframes' images.
         """
         tracked = self._atlas.finished[number]
         if factor != 1.0:
@@ -119,6 +137,7 @@ class Tracker:
         if not tracked.is_loaded:
             tracked.map.begin_sessions()
         kept_s = frozenset(result.trajectory.timestamps_s.tolist())
+        info = MapInfo(session, scale, with_images)
         return save_map(tracked, self.camera, self.config.features, earlier, kept_s, info)
 
     @property
@@ -185,6 +204,66 @@ class Tracker:
             moving_share=None if placed is None else placed.moving_share,
         )
 
+    @property
+    def is_quiet(self) -> bool:
+        """Whether nothing is under way that :meth:`state` does not hold; waits for work between frames."""
+        self._workers.between.wait()
+        return not self._finished and self._atlas.is_quiet
+
+    def state(self) -> Tree:
+        """Everything the tracker remembers, as arrays and plain values, while :attr:`is_quiet`.
+
+        A tracker of the same camera, model and settings that takes it by :meth:`restore` goes on as this one
+        would have. Images and predictions of keyframes are not in it.
+        """
+        self._workers.between.wait()
+        return {
+            "atlas": self._atlas.state(),
+            "steps": self._steps,
+            "last_time_s": self._last_time_s,
+            "is_complete": self._is_complete,
+            "earlier": [asdict(session) for session in self._earlier],
+            "watch": self._watch.state(),
+        }
+
+    def restore(
+        self,
+        state: Tree,
+        read_frame: Callable[[int], Frame],
+        read_prediction: Callable[[StoredFrame], DepthPrediction],
+    ) -> None:
+        """Go on from what :meth:`state` gave; nothing was tracked yet.
+
+        Args:
+            read_frame: reads a frame that became a keyframe, by its index.
+            read_prediction: reads the depth that was predicted for it.
+        """
+        stored = StoredKeyframes(read_frame, read_prediction)
+        self._earlier = tuple(Session(**session) for session in state["earlier"])
+        self._atlas.restore(state["atlas"], stored)
+        self._steps, self._last_time_s = state["steps"], state["last_time_s"]
+        self._is_complete = state["is_complete"]
+        self._watch.restore(state["watch"])
+
+    @property
+    def keyframes(self) -> list[tuple[StoredFrame, StoredPrediction | None]]:
+        """Handles of all keyframes of this run, and of their depth, by map and number."""
+        return [
+            (keyframe.frame, keyframe.prediction)
+            for map_ in self._atlas.maps
+            for keyframe in map_.map.keyframes
+            if keyframe.session == map_.map.session
+        ]
+
+    def complete(self) -> None:
+        """Complete what waits after the last frame; :meth:`finish` does so too."""
+        self._workers.between.wait()
+        if not self._is_complete and self._active.map.keyframes:
+            self._is_complete = True
+            with single_threaded():
+                self._active.integration.run_all()
+                self._atlas.meet()
+
     def finish(self) -> Reconstruction:
         """Adjust each map, make it metric, and return the largest one with the pose of every frame in it.
 
@@ -201,8 +280,9 @@ class Tracker:
             raise TrackingError("no frame could be placed: too few features, or no depth")
         if not any(len(map_.frames) for map_ in self._atlas.maps):
             raise TrackingError("no frame could be placed in the map that the run goes on from")
-        self._finished = True
         self._watch.next_frame()
+        self.complete()
+        self._finished = True
         with self, single_threaded():
             return finish_run(self._atlas, self.config, self._watch, self._steps)
 

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames placed in a saved map, and runs that go on from one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from saved_walk import tracked, walk_until
+from tracking_scene import CAMERA, COUNT, frames, walk
+
+from slamdepth import Map, MapLocaliser, Tracker
+from slamdepth.depth.sensor import SensorDepth
+from slamdepth.errors import DatasetError, TrackingError
+from slamdepth.geometry import invert
+from slamdepth.types import Camera, Frame, TrackingStatus
+from slamdepth.typing import Floats
+
+HALF, QUARTER = 44, 16
+
+
+@pytest.fixture(scope="module")
+def half() -> Map:
+    return walk_until(HALF)
+
+
+def errors_m(index: list[int], T_world_camera: Floats) -> Floats:
+    """Distances of poses in the map's world, which is the first camera of the walk, from the truth."""
+    truth = walk()[1][index]
+    return np.asarray(np.linalg.norm(T_world_camera[:, :3, 3] - truth[:, :3, 3], axis=1))
+
+
+def test_frames_are_placed_in_the_map_and_the_map_stays(half: Map) -> None:
+    before = {
+        (group, name): array.copy() for group, arrays in half.groups.items() for name, array in arrays.items()
+    }
+    given = frames(range(HALF, HALF + 12))
+    with MapLocaliser(half) as localiser:
+        inside = localiser._map.map
+        state = {name: getattr(inside.landmarks, name).copy() for name in vars(inside.landmarks)}
+        results = [localiser.step(frame) for frame in given]
+        trajectory = localiser.trajectory()
+        assert all(np.array_equal(getattr(inside.landmarks, name), array) for name, array in state.items())
+        assert len(inside.keyframes) == len(half)
+    assert results[0].status is TrackingStatus.RELOCALISED
+    assert len(trajectory) == len(given)
+    assert errors_m([frame.index for frame in given], trajectory.T_world_camera).max() < 0.03
+    assert all(0.0 < result.quality <= 1.0 for result in results)
+    for (group, name), array in before.items():
+        np.testing.assert_array_equal(half.groups[group][name], array)
+
+
+def test_a_lost_camera_is_found_again(half: Map) -> None:
+    def grey(frame: Frame) -> Frame:
+        return replace(frame, image_rgb=np.full_like(frame.image_rgb, 90))
+
+    given = [*frames(range(4)), *frames(range(4, 8), grey), *frames(range(20, 24))]
+    with MapLocaliser(half) as localiser:
+        found = [localiser.step(frame).T_world_camera is not None for frame in given]
+    assert found == [True] * 4 + [False] * 4 + [True] * 4
+
+
+def test_single_images_are_placed_in_any_order(half: Map) -> None:
+    given = frames([30, 2, 17])
+    with MapLocaliser(half) as localiser:
+        results = [localiser.place(frame) for frame in given]
+    poses = np.stack([result.T_world_camera for result in results if result.T_world_camera is not None])
+    assert errors_m([30, 2, 17], poses).max() < 0.03
+
+
+def test_another_room_has_no_place(half: Map) -> None:
+    from slamdepth.synth.sequence import SynthSettings, render_frames
+
+    settings = SynthSettings(frames=64, width=320, height=240, seed=11)
+    given = [frame for frame, _ in render_frames(settings, range(0, 64, 8))]
+    with MapLocaliser(half) as localiser:
+        assert all(localiser.step(frame).T_world_camera is None for frame in given)
+        assert len(localiser.trajectory()) == 0
+
+
+def test_images_of_another_camera_are_placed_as_well(half: Map) -> None:
+    import cv2
+
+    zoomed = Camera(320, 240, CAMERA.fx * 1.25, CAMERA.fy * 1.25, CAMERA.cx, CAMERA.cy)
+
+    def zoom(frame: Frame) -> Frame:
+        map_1, map_2 = cv2.initUndistortRectifyMap(
+            CAMERA.K, np.zeros(5), np.eye(3), zoomed.K, (320, 240), cv2.CV_32FC1
+        )
+        image = np.asarray(cv2.remap(frame.image_rgb, map_1, map_2, cv2.INTER_LINEAR), np.uint8)
+        return replace(frame, image_rgb=image, camera=zoomed, depth_m=None)
+
+    given = frames(range(10, 20), zoom)
+    with MapLocaliser(half, zoomed) as localiser:
+        for frame in given:
+            localiser.step(frame)
+        trajectory = localiser.trajectory()
+    assert len(trajectory) == len(given)
+    assert errors_m([frame.index for frame in given], trajectory.T_world_camera).max() < 0.03
+
+
+def test_a_closed_localiser_places_nothing(half: Map) -> None:
+    localiser = MapLocaliser(half)
+    localiser.close()
+    with pytest.raises(TrackingError):
+        localiser.step(frames([0])[0])
+
+
+def test_a_run_goes_on_from_a_map_and_extends_it() -> None:
+    begun = walk_until(QUARTER)
+    given = frames(range(QUARTER - 4, COUNT))
+    tracker, result, grown = tracked(given, begun)
+    assert tracker.is_in_start_map
+    assert len(result.trajectory) == len(given)
+    index = [frame.index for frame in given]
+    assert errors_m(index, result.trajectory.T_world_camera).max() < 0.03
+    assert len(grown) > len(begun)
+    assert [session.name for session in grown.sessions] == ["walk", "walk"]
+    assert len(grown.trajectory(0)) == len(begun.trajectory(0))
+    assert len(grown.trajectory(1)) == len(given)
+    # keyframes of the map are not of this run
+    assert {keyframe.frame.index for keyframe in result.keyframes} <= set(index)
+    with MapLocaliser(grown) as localiser:
+        assert localiser.place(frames([COUNT - 1])[0]).T_world_camera is not None
+
+
+def test_a_run_that_never_meets_its_map_says_so(half: Map) -> None:
+    from slamdepth.synth.sequence import SynthSettings, render_frames
+
+    settings = SynthSettings(frames=64, width=320, height=240, seed=11, fps=12.0)
+    given = [replace(frame, camera=CAMERA) for frame, _ in render_frames(settings, range(40))]
+    tracker, result, alone = tracked(given, half)
+    assert not tracker.is_in_start_map
+    assert len(result.trajectory) >= 10
+    assert len(alone.sessions) == 1
+    assert set(alone.groups["keyframes"]["session"].tolist()) == {0}
+
+
+def test_a_run_with_another_kind_of_depth_or_features_is_refused(half: Map) -> None:
+    from tracking_scene import ConstantDepth
+
+    from slamdepth import Config
+
+    with pytest.raises(DatasetError, match="that of a sensor, and this run's would be that of a network"):
+        Tracker(CAMERA, ConstantDepth(), start_map=half)
+    sift = Config.from_dict({"features": {"name": "sift"}})
+    with pytest.raises(DatasetError, match=r"features.name orb, and this run asks for sift"):
+        Tracker(CAMERA, SensorDepth(), sift, start_map=half)
+
+
+def test_the_world_of_a_map_is_its_first_camera(half: Map) -> None:
+    np.testing.assert_allclose(half.T_world_camera[0], np.eye(4), atol=1e-9)
+    poses = half.trajectory().T_world_camera
+    assert errors_m(list(range(HALF)), poses).max() < 0.03
+    assert np.isfinite(invert(poses)).all()
