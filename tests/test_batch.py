@@ -19,6 +19,8 @@ from command_line import ENVIRONMENT, call, command, make_long, slamdepth
 from slamdepth.errors import ConfigError, DatasetError, OutputError
 from slamdepth.pipeline.batch import BatchProgress, Recording, find_recordings, run_batch
 from slamdepth.pipeline.batch.job import Job, State, failure, share_cores
+from slamdepth.pipeline.batch.run import _job
+from slamdepth.pipeline.checkpoint import begin
 
 PATIENCE_S = 300.0
 QUICK = "--depth sensor --no-mesh --max-frames 4"
@@ -97,6 +99,19 @@ def test_a_run_without_its_report_is_done_again(tmp_path: Path) -> None:
     again = run_batch(recordings("one", "two"), tmp_path / "b")
     assert again["not_repeated"] == ["two"]
     assert again["counts"]["done"] == 2
+
+
+def test_a_half_run_goes_on_and_a_failed_one_does_not(tmp_path: Path) -> None:
+    def command_of(state: str, arguments: tuple[str, ...] = ("one",)) -> list[str]:
+        return _job("one", arguments, tmp_path, {"arguments": ["one"], "state": state}).command()
+
+    (tmp_path / "one").mkdir()
+    assert "--overwrite" in command_of("waiting")  # nothing to go on with
+    begin(tmp_path / "one", {})
+    goes_on = ["run", "--resume", str(tmp_path / "one")]
+    assert command_of("waiting")[-3:] == command_of("stopped")[-3:] == goes_on
+    assert "--overwrite" in command_of("failed")
+    assert "--overwrite" in command_of("stopped", ("one", "--seed", "2"))
 
 
 @pytest.mark.usefixtures("pretend")
@@ -261,6 +276,7 @@ def test_a_killed_batch_leaves_no_run_behind(tiny_room: Path, tmp_path: Path) ->
     process = start_batch(room, tmp_path / "b")
     process.kill()
     process.communicate(timeout=PATIENCE_S)
+    assert json.loads((tmp_path / "b" / "batch.json").read_text())["runs"][0]["state"] == "waiting"
     assert ends(tmp_path / "b" / "room" / "trajectory_online.txt")
 
 

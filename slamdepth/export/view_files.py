@@ -32,11 +32,13 @@ class Written:
         tracks: refined in the images, where there are any; None where the run kept no landmarks.
         colors: ``(P, 3)`` uint8 of their points.
         missing: numbers of the views whose image does not decode any more.
+        tracked_error_px: mean reprojection error before the tracks were refined; 0 without tracks.
     """
 
     tracks: Tracks | None
     colors: Bytes
     missing: tuple[int, ...]
+    tracked_error_px: float = 0.0
 
 
 def write_views(request: ExportRequest, images: ExportImages, folder: Path) -> Written:
@@ -48,7 +50,7 @@ def write_views(request: ExportRequest, images: ExportImages, folder: Path) -> W
     colours, greys = Colours(tracks), GreyImages()
     missing = _write_images(request, images, folder, colours, greys)
     refined, kept = refine_tracks(scene, images, tracks, greys)
-    return Written(refined, colours.rgb()[kept], missing)
+    return Written(refined, colours.rgb()[kept], missing, tracks.mean_error_px)
 
 
 def _write_images(

@@ -17,6 +17,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from slamdepth.errors import DatasetError
+from slamdepth.pipeline.checkpoint import read_begun
+
 LOGS = "logs"
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _LOOK_EVERY_S = 0.1
@@ -50,11 +53,13 @@ class Job:
         name: of its folder in that of the batch.
         arguments: of ``slamdepth run``: the recording, then options.
         output: folder of the batch.
+        may_go_on: a half run in the folder is of the same arguments, so that it need not start again.
     """
 
     name: str
     arguments: tuple[str, ...]
     output: Path
+    may_go_on: bool = False
 
     @property
     def folder(self) -> Path:
@@ -67,8 +72,11 @@ class Job:
         return self.output / LOGS / f"{self.name}.log"
 
     def command(self) -> list[str]:
-        """The command line of the run; a half run in its folder is replaced."""
-        given = ["run", *self.arguments, "--output", str(self.folder), "--overwrite"]
+        """The command line of the run: from its last checkpoint, else from the start."""
+        if self.may_go_on and _is_half(self.folder):
+            given = ["run", "--resume", str(self.folder)]
+        else:
+            given = ["run", *self.arguments, "--output", str(self.folder), "--overwrite"]
         return [sys.executable, "-c", _WITH_PARENT, *given]
 
 
@@ -142,6 +150,14 @@ def is_finished(folder: Path) -> bool:
     return report is not None and not report.get("options", {}).get("interrupted", False)
 
 
+def _is_half(folder: Path) -> bool:
+    """True where a run was begun and did not come to its end."""
+    try:
+        return read_begun(folder) is not None
+    except DatasetError:  # damaged, or of another version
+        return False
+
+
 def read_report(folder: Path) -> dict[str, Any] | None:
     """``report.json`` of a run; None where there is none that can be read."""
     try:
@@ -166,13 +182,13 @@ def failure(log: Path, code: int) -> str:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a run: the first signal would have it finish with the frames it has, the second ends it at once."""
+    """End a run at once: after the first signal alone it would finish with the frames it has."""
     deadline = time.monotonic() + _PATIENCE_S
     for number in (signal.SIGTERM, signal.SIGTERM):
         if process.poll() is None:
             process.send_signal(number)
             with suppress(subprocess.TimeoutExpired):
-                process.wait(1.0)
+                process.wait(0.2)
     with suppress(subprocess.TimeoutExpired):
         process.wait(max(0.0, deadline - time.monotonic()))
     if process.poll() is None:

@@ -54,8 +54,8 @@ def run_batch(
     """Run many recordings, each with ``slamdepth run`` in a process of its own.
 
     A run that fails stops no other. A batch that is given again goes on where it stopped: runs that came to
-    their end with the same options are not repeated; half and failed ones are done again. ``batch.json`` and
-    ``batch.html`` in ``output`` are written anew whenever a run ends.
+    their end with the same options are not repeated, half ones go on from their last checkpoint, failed ones
+    are done again. ``batch.json`` and ``batch.html`` in ``output`` are written anew whenever a run ends.
 
     Args:
         recordings: what to run, see :func:`find_recordings`.
@@ -105,7 +105,7 @@ class _Batch:
         self._lock = threading.Lock()
         names = _names(recordings, before)
         self._jobs = [
-            Job(name, (one.path, *options, *one.options), folder.absolute())
+            _job(name, (one.path, *options, *one.options), folder.absolute(), before.get(name, {}))
             for name, one in zip(names, recordings, strict=True)
         ]
         self._outcomes = {job.name: self._known(job, before) for job in self._jobs}
@@ -160,6 +160,12 @@ class _Batch:
             "wall_s": outcome.wall_s,
             **batch_row(report),
         }
+
+
+def _job(name: str, arguments: tuple[str, ...], output: Path, entry: dict[str, Any]) -> Job:
+    """A job; it goes on with what a stopped or killed batch left, not with what failed."""
+    is_same = tuple(entry.get("arguments", ())) == arguments
+    return Job(name, arguments, output, is_same and entry.get("state") != State.FAILED.value)
 
 
 def _earlier(folder: Path) -> dict[str, dict[str, Any]]:
