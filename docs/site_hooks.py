@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 _OUTSIDE = re.compile(r"\[([^\]]+)\]\((?:\.\./)+(?!experiments/)[^)]*\)|\[([^\]]+)\]\((?:examples/)[^)]*\)")
+_ROLE = re.compile(r":(?:func|class|meth|attr|mod|data):<code>~?([^<]*)</code>")
 
 
 def on_config(config: Any) -> Any:
@@ -20,6 +21,11 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links to files that are no pages are shown as text; links of pages in folders stay."""
     depth = page.file.src_uri.count("/")
     return _OUTSIDE.sub(lambda found: _as_text(found, depth), markdown)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Sphinx's roles of docstrings become plain code."""
+    return _ROLE.sub(r"<code>\1</code>", html)
 
 
 def _as_text(found: re.Match[str], depth: int) -> str:

@@ -117,6 +117,7 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     page = (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
     for name in set(slamdepth.__all__) - {"__version__"}:
         assert re.search(rf'id="slamdepth[\w.]*\.{name}"', page), name
+    assert ":func:" not in page
     for path in (tmp_path / "site").glob("*.html"):
         loaded = re.findall(
             r'<(?:script|link|img)[^>]*(?:src|href)="(https?:[^"]*)"', path.read_text("utf-8")
