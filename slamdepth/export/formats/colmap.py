@@ -51,8 +51,8 @@ class ColmapFormat(ExportFormat):
         (model / "points3D.bin").write_bytes(_points(tracks, written.colors))
         lines = [
             f"{len(scene.views)} images, {len(tracks.points_m)} points, {tracks.observations} observations; "
-            f"mean reprojection error {tracks.mean_error_px:.3f} px ({written.tracked_error_px:.3f} before they "
-            "were refined in the images).",
+            f"mean reprojection error {tracks.mean_error_px:.3f} px "
+            f"({written.tracked_error_px:.3f} before they were refined in the images).",
             f"{tracks.dropped} observations are left out: more than 4 px off, or not in the image.",
         ]
         if written.missing:
