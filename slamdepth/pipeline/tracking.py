@@ -116,7 +116,8 @@ def track(
     progress(replace(run.state(run.steps[-1]), stage=RunStage.OPTIMISING))
     if checkpoints is not None and isinstance(tracker, Tracker):
         tracker.complete()
-        checkpoints.write(tracker, lambda: run.so_far(is_complete=True))
+        if tracker.is_quiet:
+            checkpoints.write(tracker, lambda: run.so_far(is_complete=True))
     return _finished(tracker, run)
 
 

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs that are killed go on from their last checkpoint, and end as if nothing had happened."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import ENVIRONMENT, call, command, leave_out_plots, make_long
+from tracking_scene import CAMERA, CONFIG, COUNT, ConstantDepth, colour_only, frames, walk
+
+from slamdepth import DepthPrediction, Frame, StoredFrame, Tracker
+from slamdepth.depth.base import DepthModel
+from slamdepth.depth.sensor import SensorDepth
+from slamdepth.errors import OutputError
+from slamdepth.io.tensors import decode_tensors, encode_tensors
+from slamdepth.io.tree import flattened, restored
+from slamdepth.pipeline import checkpoint
+from slamdepth.pipeline.steps import steps_of, steps_state
+from slamdepth.types import StepResult
+
+PATIENCE_S = 600.0
+
+
+def read_frame(index: int) -> Frame:
+    return walk()[0][index]
+
+
+@pytest.mark.parametrize(("model", "change"), [(SensorDepth, None), (ConstantDepth, colour_only)])
+def test_a_restored_tracker_goes_on_as_the_first_one_would_have(
+    model: Callable[[], DepthModel], change: Callable[[Frame], Frame] | None
+) -> None:
+    given = frames(range(COUNT), change)
+    first = Tracker(CAMERA, model(), CONFIG)
+    saved: list[tuple[int, bytes]] = []
+    steps: list[StepResult] = []
+    for n, frame in enumerate(given):
+        steps.append(first.step(frame))
+        if n > 10 and n >= (saved[-1][0] + 15 if saved else 0) and first.is_quiet:
+            plain, arrays = flattened(first.state())
+            saved.append((n + 1, encode_tensors(arrays, {"tree": plain})))
+    assert len(saved) >= 2
+    ended = first.finish()
+
+    def predict(frame: StoredFrame) -> DepthPrediction:
+        return model().predict(frame.load())
+
+    for done, data in saved:
+        second = Tracker(CAMERA, model(), CONFIG)
+        arrays, about = decode_tensors(data)
+        second.restore(restored(about["tree"], arrays), read_frame, predict)
+        for frame, before in zip(given[done:], steps[done:], strict=True):
+            after = second.step(frame)
+            assert (after.status, after.inliers, after.is_keyframe) == (
+                before.status,
+                before.inliers,
+                before.is_keyframe,
+            )
+            np.testing.assert_array_equal(after.T_world_camera, before.T_world_camera)
+        again = second.finish()
+        np.testing.assert_array_equal(again.trajectory.T_world_camera, ended.trajectory.T_world_camera)
+        np.testing.assert_array_equal(again.points_m, ended.points_m)
+        assert again.statistics.loop_closures == ended.statistics.loop_closures
+        assert again.statistics.readout_s == ended.statistics.readout_s
+
+
+def test_results_of_frames_come_back_from_arrays() -> None:
+    tracker = Tracker(CAMERA, SensorDepth(), CONFIG)
+    steps = [tracker.step(frame) for frame in frames(range(6))]
+    tracker.close()
+    plain, arrays = flattened(steps_state(steps))
+    for before, after in zip(steps, steps_of(restored(json.loads(json.dumps(plain)), arrays)), strict=True):
+        assert before.status is after.status
+        assert before.timings_ms == after.timings_ms
+        assert (before.index, before.inliers, before.quality) == (after.index, after.inliers, after.quality)
+        np.testing.assert_array_equal(before.T_world_camera, after.T_world_camera)
+        np.testing.assert_array_equal(before.covariance, after.covariance)
+    assert steps_of(steps_state([])) == ()
+
+
+@pytest.fixture(scope="module")
+def room(tiny_room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_long(tiny_room, tmp_path_factory.mktemp("long") / "room", repeats=3)
+
+
+def arguments(room: Path, folder: Path, every_s: float) -> list[object]:
+    options = ("--depth", "sensor", "--no-mesh", "--checkpoint-every", every_s)
+    return ["run", room, "--output", folder, *options]
+
+
+def kill_at(room: Path, folder: Path, is_there: Callable[[], bool]) -> None:
+    """Start a run with frequent checkpoints and kill it as soon as something is there."""
+    process = subprocess.Popen(
+        command(*arguments(room, folder, 0.05)), env=ENVIRONMENT, stdout=subprocess.DEVNULL
+    )
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not is_there():
+        assert process.poll() is None
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+    process.kill()
+    process.wait()
+
+
+def test_a_killed_run_ends_with_the_same_bytes(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_out_plots(monkeypatch)
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    assert call(*arguments(room, whole, 0)).returncode == 0
+    kill_at(room, killed, (killed / "checkpoint" / "latest.json").exists)
+    assert not (killed / "report.json").exists()
+    done = call("run", "--resume", killed)
+    assert done.returncode == 0, done.stderr
+    for name in ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map/keyframes.safetensors"):
+        assert (killed / name).read_bytes() == (whole / name).read_bytes(), name
+    assert not (killed / "checkpoint").exists()
+    reports = [json.loads((folder / "report.json").read_text()) for folder in (killed, whole)]
+    assert reports[0]["frames"] == reports[1]["frames"] == 3 * 78
+    assert "going on from the checkpoint" in (killed / "log.txt").read_text()
+    again = call("run", "--resume", killed)
+    assert (again.returncode, "is finished" in again.stdout) == (0, True)
+
+
+def test_a_run_killed_before_its_first_checkpoint_starts_again(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_out_plots(monkeypatch)
+    folder = tmp_path / "run"
+    kill_at(room, folder, (folder / "checkpoint" / "run.json").exists)
+    for file in (folder / "checkpoint").glob("latest.json"):
+        file.unlink()
+    done = call("run", "--resume", folder)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((folder / "report.json").read_text())["frames"] == 3 * 78
+
+
+def test_what_cannot_go_on_is_said_in_one_line(room: Path, tiny_room: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    kill_at(room, folder, (folder / "checkpoint" / "latest.json").exists)
+
+    def refused(*given: object) -> str:
+        done = call("run", "--resume", *given)
+        assert done.returncode == 2, done.stdout
+        assert done.stderr.count("\n") == 1
+        return done.stderr
+
+    assert "holds no run" in refused(tmp_path)
+    assert "is not the sequence" in refused(folder, tiny_room)
+    state = next((folder / "checkpoint").glob("state-*.safetensors"))
+    data = bytearray(state.read_bytes())
+    data[-5] ^= 1
+    state.write_bytes(bytes(data))
+    assert f"{state.name}: is damaged" in refused(folder)
+    latest = folder / "checkpoint" / "latest.json"
+    latest.write_text(json.dumps({**json.loads(latest.read_text()), "version": 99}))
+    assert "has version 99" in refused(folder)
+
+
+def test_where_the_disk_is_full_the_run_goes_on_without_checkpoints(
+    tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_out_plots(monkeypatch)
+
+    def full(path: Path, data: bytes) -> str:
+        raise OutputError(f"{path}: cannot be written: No space left on device")
+
+    monkeypatch.setattr(checkpoint, "write_bytes", full)
+    done = call(*arguments(tiny_room, tmp_path / "run", 0.01))
+    assert done.returncode == 0, done.stderr
+    assert "no more checkpoints are written, the run goes on" in (tmp_path / "run" / "log.txt").read_text()
