@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from decimal import Decimal
@@ -207,6 +208,36 @@ def test_bad_input_is_one_line(result: RunResult, arguments: list[str], says: st
     assert done.returncode == 2
     assert says in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("file", "data", "to", "says"),
+    [
+        ("report.json", None, "tum", "the run did not end"),
+        ("report.json", b"[1]", "tum", "is no report of a run"),
+        ("report.json", b"{", "tum", "cannot be read"),
+        ("trajectory.txt", b"1 2 3\n", "tum", "trajectory.txt:1"),
+        ("keyframes.txt", None, "kitti", "keyframes.txt"),
+        ("mesh.ply", b"ply\nformat", "obj", "holds no mesh, or is damaged"),
+        ("mesh.ply", None, "glb", "has no mesh to export: run it without --no-mesh"),
+        ("map/map.json", b"{}", "colmap", "is no map of slamdepth"),
+        ("map/keyframes.safetensors", b"x", "nerfstudio", "keyframes.safetensors"),
+        ("README.txt", b"A run of slamdepth", "colmap", "name it by --recording"),
+    ],
+)
+def test_a_damaged_run_is_one_line(
+    result: RunResult, tmp_path: Path, file: str, data: bytes | None, to: str, says: str
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(result.folder, run, ignore=shutil.ignore_patterns("export"))
+    (run / file).unlink()
+    if data is not None:
+        (run / file).write_bytes(data)
+    done = call("export", run, "--to", to)
+    assert done.returncode == 2, done.stderr
+    assert says in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (run / "export" / to).exists()
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
