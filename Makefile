@@ -37,7 +37,7 @@ layers: install-dev
 check: lint types layers test
 
 docs: install-docs
-	$(BIN)/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 dist: $(VENV)/.dist
 	rm -rf dist
