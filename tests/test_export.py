@@ -17,7 +17,7 @@ from command_line import call, leave_out_plots, slamdepth
 from nerfstudio_rules import read_transforms
 
 import slamdepth as package
-from slamdepth.datasets import open_dataset
+from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.errors import ConfigError, InputError, OutputError
 from slamdepth.export import FORMATS, ExportRequest, ExportScene, ImageMode, View, write_export
 from slamdepth.export.formats.euroc import nanoseconds
@@ -29,7 +29,7 @@ from slamdepth.io import read_tum_trajectory
 from slamdepth.open3d_loader import import_open3d
 from slamdepth.pipeline import RunResult
 from slamdepth.pipeline.folder import recorded_arguments
-from slamdepth.types import Camera, Trajectory
+from slamdepth.types import Camera, Frame, Trajectory
 
 ALL = ("colmap", "euroc", "glb", "kitti", "nerfstudio", "obj", "ply", "tum")
 
@@ -339,6 +339,47 @@ def test_keypoints_that_do_not_fit_are_left_out() -> None:
     tracks = build_tracks(moved, ExportImages(moved, None, ImageMode.RAW))
     assert (tracks.rows[0][:5] == -1).all()
     assert tracks.error_px.max() < 0.02
+
+
+class LargeRecording(Dataset):
+    """The recording of :func:`exact_scene` in three times the size that was tracked."""
+
+    name, path, has_depth, ground_truth = "large", Path("large"), False, None
+
+    def __init__(self, scene: ExportScene) -> None:
+        self.notes: list[str] = []
+        self.camera, self.timestamps_s = CAMERA, scene.trajectory.timestamps_s
+        self.large = CAMERA.scaled(960, 720)
+
+    def __len__(self) -> int:
+        return len(self.timestamps_s)
+
+    def read(self, index: int, *, with_depth: bool = False) -> Frame:
+        raise AssertionError("the original is asked for")
+
+    def read_original(self, index: int) -> Frame:
+        image = np.random.default_rng(index).integers(0, 256, (720, 960, 3), np.uint8)
+        return Frame(index, float(self.timestamps_s[index]), image, self.large)
+
+
+@pytest.mark.parametrize("mode", ["raw", "undistorted"])
+def test_images_have_the_size_of_the_recording(mode: str, tmp_path: Path) -> None:
+    scene = exact_scene()
+    images = ExportImages(scene, LargeRecording(scene), ImageMode(mode))
+    assert images.magnification == 3.0
+    assert images.image(scene.views[0]).shape == (images.camera.height, images.camera.width, 3)
+    assert images.camera.width > 900
+    tracks = build_tracks(scene, images)
+    assert tracks.mean_error_px < 0.06
+
+
+def test_a_keypoint_may_be_off_by_as_many_tracked_pixels_in_a_large_image() -> None:
+    scene = exact_scene()
+    first = scene.views[0]
+    px = first.keypoints_px + np.array([MAX_ERROR_PX - 1, 0])
+    moved = replace(scene, views=(replace(first, keypoints_px=px), *scene.views[1:]))
+    large = build_tracks(moved, ExportImages(moved, LargeRecording(moved), ImageMode.RAW))
+    assert np.count_nonzero(large.rows[0] >= 0) > 50
 
 
 def test_undistorted_images_show_something_everywhere() -> None:

@@ -58,6 +58,7 @@ class ExportImages:
 
     Attributes:
         camera: of the exported images; integer pixel centres.
+        magnification: pixels of the exported images in one of those that were tracked.
 
     Raises:
         DatasetError: there is no recording, and the camera is unknown; or it is another recording.
@@ -68,6 +69,7 @@ class ExportImages:
         self._rows = {time_s: row for row, time_s in enumerate(scene.trajectory.timestamps_s.tolist())}
         self._full = self._full_camera()
         self._tracked = scene.camera or self._full
+        self.magnification = self._full.width / self._tracked.width
         self._inverse_depth = _usual_inverse_depth(scene)
         self._rectifier = Rectifier(self._full, scene.readout_s)
         self.camera, self._window = self._exported_camera()

@@ -21,9 +21,8 @@ from slamdepth.geometry import invert
 from slamdepth.mapping.codec import Encoded, encode_image
 from slamdepth.typing import Bools, Bytes, Floats, Ints
 
-_WORKING_PX = 640  # longest side of the images that are compared
+_WORKING_PX = 1280  # longest side of the images that are compared
 _WINDOW_PX = 21
-_LEVELS = 1
 _HOME_PX = 0.5  # the way there and back
 _STEPS = (30, 0.01)  # at most, and until a step is so many pixels
 _TRIANGULATIONS = 8
@@ -86,12 +85,9 @@ def refine_tracks(
     seen = np.flatnonzero((point >= 0) & np.array([n in greys for n in range(len(scene.views))])[view])
     moved = px.copy()
     found = np.zeros(len(px), np.bool_)
+    depth = _depth(T_camera_world[view[seen]], tracks.points_m[point[seen]])
     moved[seen], found[seen] = _followed(
-        view[seen],
-        point[seen],
-        px[seen],
-        _depth(T_camera_world[view[seen]], tracks.points_m[point[seen]]),
-        greys,
+        view[seen], point[seen], px[seen], depth, greys, images.magnification
     )
     count = np.bincount(point[found], minlength=len(tracks.points_m))
     found[found] = count[point[found]] >= 2
@@ -106,7 +102,7 @@ def refine_tracks(
         at = np.flatnonzero(found & (view == number))
         predicted, ahead = images.project(one, points_m[point[at]])
         error[at] = np.where(ahead, np.linalg.norm(predicted - moved[at], axis=1), np.inf)
-    rows = np.where(error <= MAX_ERROR_PX, point, -1)
+    rows = np.where(error <= MAX_ERROR_PX * images.magnification, point, -1)
     ends = np.cumsum([len(one) for one in tracks.rows])[:-1]
     return numbered(
         points_m,
@@ -117,7 +113,9 @@ def refine_tracks(
     )
 
 
-def _followed(view: Ints, point: Ints, px: Floats, depth: Floats, greys: GreyImages) -> tuple[Floats, Bools]:
+def _followed(
+    view: Ints, point: Ints, px: Floats, depth: Floats, greys: GreyImages, magnification: float
+) -> tuple[Floats, Bools]:
     """Pixels ``(M, 2)`` of observations as followed from each point's reference, and which were found.
 
     The reference of a point is the view whose distance is nearest to the mean of all: no view shows it much
@@ -136,20 +134,23 @@ def _followed(view: Ints, point: Ints, px: Floats, depth: Floats, greys: GreyIma
     pairs = np.stack([view[source[others]], view[others]], axis=1)
     for pair in np.unique(pairs, axis=0):
         at = others[(pairs == pair).all(axis=1)]
-        there, good = _flow(greys, pair[0], pair[1], px[source[at]], px[at])
+        there, good = _flow(greys, pair[0], pair[1], px[source[at]], px[at], magnification)
         moved[at[good]], found[at] = there[good], good
     return moved, found
 
 
-def _flow(greys: GreyImages, a: int, b: int, px_a: Floats, px_b: Floats) -> tuple[Floats, Bools]:
+def _flow(
+    greys: GreyImages, a: int, b: int, px_a: Floats, px_b: Floats, magnification: float
+) -> tuple[Floats, Bools]:
     """Follow pixels from image ``a`` into ``b``, near ``px_b``; which lead back home."""
     import cv2
 
     image_a, image_b = greys.load(a), greys.load(b)
+    reach_px = MAX_ERROR_PX * greys.share * magnification
     start, guess = (((px + 0.5) * greys.share - 0.5).astype(np.float32)[:, None] for px in (px_a, px_b))
     settings: dict[str, Any] = {
         "winSize": (_WINDOW_PX, _WINDOW_PX),
-        "maxLevel": _LEVELS,
+        "maxLevel": 1 if reach_px <= MAX_ERROR_PX else 2,
         "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, *_STEPS),
         "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
     }
@@ -157,7 +158,7 @@ def _flow(greys: GreyImages, a: int, b: int, px_a: Floats, px_b: Floats) -> tupl
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(image_b, image_a, there, start.copy(), **settings)
     good = (found[:, 0] > 0) & (found_back[:, 0] > 0)
     good &= np.linalg.norm(back - start, axis=2)[:, 0] < _HOME_PX
-    good &= np.linalg.norm(there - guess, axis=2)[:, 0] < MAX_ERROR_PX
+    good &= np.linalg.norm(there - guess, axis=2)[:, 0] < reach_px
     return (there[:, 0].astype(np.float64) + 0.5) / greys.share - 0.5, np.asarray(good, np.bool_)
 
 

@@ -14,7 +14,7 @@ from slamdepth.export.scene import ExportScene
 from slamdepth.typing import Bytes, Floats, Ints
 
 MAX_ERROR_PX = 4.0
-"""Farther observations are left out, as COLMAP's mapper does (``filter_max_reproj_error``)."""
+"""Pixels as tracked. Farther observations are left out, as by COLMAP (``filter_max_reproj_error``)."""
 _GREY = 128
 
 
@@ -61,7 +61,7 @@ def build_tracks(scene: ExportScene, images: ExportImages) -> Tracks:
         projected, ahead = images.project(view, scene.points_m[rows[at]])
         error = np.linalg.norm(projected - px[at], axis=1)
         offered += int(np.count_nonzero(view.point_rows >= 0))
-        rows[at[~(ahead & (error <= MAX_ERROR_PX))]] = -1
+        rows[at[~(ahead & (error <= MAX_ERROR_PX * images.magnification))]] = -1
         full = np.zeros(len(px))
         full[at] = error
         keypoints.append(px[shown])

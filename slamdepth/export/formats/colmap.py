@@ -53,7 +53,7 @@ class ColmapFormat(ExportFormat):
             f"{len(scene.views)} images, {len(tracks.points_m)} points, {tracks.observations} observations; "
             f"mean reprojection error {tracks.mean_error_px:.3f} px "
             f"({written.tracked_error_px:.3f} before they were refined in the images).",
-            f"{tracks.dropped} observations are left out: more than 4 px off, or not in the image.",
+            f"{tracks.dropped} observations are left out: more than 4 px (as tracked) off, or hidden.",
         ]
         if written.missing:
             lines.append(f"{len(written.missing)} images do not decode and are missing.")
