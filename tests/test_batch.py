@@ -163,11 +163,11 @@ def test_the_folder_of_something_else_is_refused(tmp_path: Path) -> None:
 def test_recordings_are_found(tmp_path: Path) -> None:
     for name in ("b.mp4", "a.mp4", "c.mov"):
         (tmp_path / name).write_text("")
-    (tmp_path / "list.txt").write_text("# mine\nc.mov --camera 'my phone.yaml'\n\nrtsp://cam/1\n")
+    (tmp_path / "list.txt").write_text("# mine\nc.mov --camera 'my phone.yaml'\n\nrtsp://cam/1\ncamera:0\n")
     found = find_recordings([str(tmp_path / "*.mp4"), str(tmp_path / "list.txt"), str(tmp_path / "a.mp4")])
-    assert [Path(one.path).name for one in found] == ["a.mp4", "b.mp4", "c.mov", "1"]
+    assert [Path(one.path).name for one in found] == ["a.mp4", "b.mp4", "c.mov", "1", "camera:0"]
     assert found[2] == Recording(str(tmp_path / "c.mov"), ("--camera", "my phone.yaml"))
-    assert found[3].path == "rtsp://cam/1"
+    assert [one.path for one in found[3:]] == ["rtsp://cam/1", "camera:0"]
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ class Recording:
     """One recording of a batch.
 
     Attributes:
-        path: as ``slamdepth run`` takes it; an address such as ``rtsp://...`` stays as it is.
+        path: as ``slamdepth run`` takes it; addresses such as ``rtsp://...`` and ``camera:0`` stay as they are.
         options: of its line in a list, which come after those of the batch.
     """
 
@@ -51,12 +51,17 @@ def find_recordings(inputs: Sequence[str]) -> tuple[Recording, ...]:
                 raise DatasetError(f"{text}: matches no file and no folder")
             found += [Recording(match) for match in matches]
         else:
-            found.append(Recording(text if "://" in text else str(path)))
+            found.append(Recording(text if _is_address(text) else str(path)))
     unique = {one.path: one for one in reversed(found)}
     kept = [one for one in found if unique.get(one.path) is one]
     if not kept:
         raise DatasetError("no recordings: name videos, folders, patterns, or a .txt list of them")
     return tuple(kept)
+
+
+def _is_address(text: str) -> bool:
+    """Whether a recording is a live source rather than a file."""
+    return "://" in text or text.startswith("camera:")
 
 
 def _of_list(path: Path) -> list[Recording]:
@@ -69,7 +74,8 @@ def _of_list(path: Path) -> list[Recording]:
         except ValueError as error:
             raise DatasetError(f"{path}:{number}: {error}: quote paths as in a shell") from error
         if words:
-            place = words[0] if "://" in words[0] else str(path.parent / Path(words[0]).expanduser())
+            is_file = not _is_address(words[0])
+            place = str(path.parent / Path(words[0]).expanduser()) if is_file else words[0]
             found.append(Recording(place, tuple(words[1:])))
     if not found:
         raise DatasetError(f"{path}: lists no recordings; a line is a path, optionally with options of a run")
