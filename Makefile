@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 # make demo   everything from nothing: environment, weights, a sequence, the main job
 # make test   the tests
-# make docs   the API reference, from the docstrings, in docs/api/
 # make fuzz   damaged input for every reader and parser; CASES of each, 1,000 unless said
+# make docs   the site of the documentation, in site/
+# make check-dist   wheel and sdist, checked; PYTHONS="python3.10 ..." also installs the wheel
 
 PYTHON ?= python3
+PYTHONS ?=
 VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 SOURCES := pyproject.toml constraints.txt README.md LICENSE \
 	$(shell find slamdepth -type f -not -name '*.pyc' -not -name '.*')
 
-.PHONY: demo test fuzz lint types layers check docs install install-dev install-docs format clean
+.PHONY: demo test fuzz lint types layers check docs dist check-dist install install-dev install-docs format clean
 
 demo: install
 	$(BIN)/slamdepth weights pull
@@ -41,7 +43,15 @@ layers: install-dev
 check: lint types layers test
 
 docs: install-docs
-	$(BIN)/python docs/make_api.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+dist: $(VENV)/.dist
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
+
+check-dist: dist
+	$(BIN)/python packaging/check_dist.py dist $(if $(PYTHONS),--install $(PYTHONS))
 
 format: install-dev
 	$(BIN)/ruff check --fix .
@@ -62,9 +72,13 @@ $(VENV)/.dev: $(VENV)/.package
 	$(PIP) '.[dev]'
 	touch $@
 
+$(VENV)/.dist: | $(BIN)/python
+	$(PIP) 'build>=1.2,<2' 'twine>=6,<8'
+	touch $@
+
 $(VENV)/.docs: $(VENV)/.package
 	$(PIP) '.[docs]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo docs/api build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) demo site build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from slamdepth.mapping.reconstruction import Reconstruction
     from slamdepth.mapstore import Map, Session
     from slamdepth.pipeline import RunInterrupted, RunProgress, RunResult, RunStage, Watcher
+    from slamdepth.pipeline.export import export_run
     from slamdepth.pipeline.localize import Localisation, localize
     from slamdepth.pipeline.merge import MergeResult, merge
     from slamdepth.pipeline.resume import resume
@@ -116,6 +117,7 @@ _HOME = {
     "create_depth_model": "slamdepth.depth.registry",
     "create_tracker": "slamdepth.tracking",
     "densify": "slamdepth.dense",
+    "export_run": "slamdepth.pipeline.export",
     "localize": "slamdepth.pipeline.localize",
     "merge": "slamdepth.pipeline.merge",
     "open_dataset": "slamdepth.datasets",
@@ -184,6 +186,7 @@ __all__ = [
     "create_depth_model",
     "create_tracker",
     "densify",
+    "export_run",
     "localize",
     "merge",
     "open_dataset",

@@ -16,6 +16,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from slamdepth.cli import (
+    batch,
     calibrate,
     compare,
     data_stats,
@@ -23,6 +24,7 @@ from slamdepth.cli import (
     eval_depth,
     evaluate,
     evaluate_mesh,
+    export,
     info,
     localize,
     merge,
@@ -49,6 +51,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("run")(run.run_command)
+app.command("batch")(batch.batch_command)
+app.command("export")(export.export_command)
 app.command("localize")(localize.localize_command)
 app.command("merge")(merge.merge_command)
 app.command("info")(info.info_command)

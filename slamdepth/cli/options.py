@@ -70,3 +70,8 @@ HostOption = Annotated[
         "--host", metavar="ADDRESS", help="Address it listens at; by default only this machine reaches it."
     ),
 ]
+
+
+def export_names(text: str | None) -> tuple[str, ...]:
+    """The formats named in ``--export colmap,glb``."""
+    return tuple(dict.fromkeys(name.strip() for name in (text or "").split(",") if name.strip()))

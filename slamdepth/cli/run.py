@@ -20,6 +20,7 @@ from slamdepth.cli.options import (
     SecondsOption,
     StrideOption,
     TopicOption,
+    export_names,
 )
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
@@ -36,6 +37,7 @@ _PLACES = {
     "mesh file": "mesh.ply",
     "map": "map",
     "report": "report.html",
+    "exports": "export",
 }
 
 
@@ -154,6 +156,13 @@ def run_command(
     voxel_size: Annotated[
         float | None, typer.Option(metavar="M", help="Edge of the mesh's voxels in metres. Default: 0.02")
     ] = None,
+    export: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME[,NAME]",
+            help="Also export the result to colmap, nerfstudio, ...; see 'slamdepth export --help'.",
+        ),
+    ] = None,
     device: Annotated[
         str | None, typer.Option(metavar="cpu|cuda", help="Where the network runs. Default: cpu")
     ] = None,
@@ -257,6 +266,7 @@ def run_command(
             stride=stride,
             mesh=not no_mesh,
             overwrite=overwrite,
+            export=export_names(export),
             start_map=start_map,
             map_images=map_images,
             checkpoint_s=checkpoint_every,

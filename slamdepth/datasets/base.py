@@ -85,6 +85,16 @@ class Dataset(Protocol):
         """
         return []
 
+    def read_original(self, index: int) -> Frame:
+        """Read the colour image of a frame in the size it was recorded in, with the camera of that size.
+
+        :meth:`read` may give a smaller one.
+
+        Raises:
+            IndexError, ImageDecodeError, CameraError: as :meth:`read`.
+        """
+        return self.read(index)
+
     def __iter__(self) -> Iterator[Frame]:
         """Every frame in order, with sensor depth where there is any; see :meth:`frames`."""
         return self.frames(with_depth=self.has_depth)

@@ -37,7 +37,7 @@ class FrameViews:
 
     def positions(self, row: int) -> Floats32 | None:
         """Where the rectified pixels of a frame come from, see :meth:`Rectifier.positions`."""
-        return self._rectifier.positions(self._velocity(row), self._inverse_depth)
+        return self._rectifier.positions(velocity_at(self._trajectory, row), self._inverse_depth)
 
     def load(self, rows: Iterable[int]) -> None:
         """Read what is asked for and not there yet, in order, and forget all others."""
@@ -58,11 +58,15 @@ class FrameViews:
         grey = self._rectifier.grey(image_rgb, self.positions(row))
         return View(grey, self._trajectory.T_world_camera[row])
 
-    def _velocity(self, row: int) -> Floats | None:
-        """Velocity ``(6,)`` of the camera, from the frames before and after; None where unknown."""
-        times_s, poses = self._trajectory.timestamps_s, self._trajectory.T_world_camera
-        before, after = max(0, row - 1), min(len(times_s) - 1, row + 1)
-        interval_s = float(times_s[after] - times_s[before])
-        if not 0 < interval_s <= 2 * _CONSECUTIVE_S:
-            return None
-        return velocity_between(invert(poses[before]), invert(poses[after]), interval_s)
+
+def velocity_at(trajectory: Trajectory, row: int) -> Floats | None:
+    """Velocity ``(6,)`` of the camera at a pose, from the frames before and after; None where unknown.
+
+    See :func:`slamdepth.frontend.rolling_shutter.velocity_between`.
+    """
+    times_s, poses = trajectory.timestamps_s, trajectory.T_world_camera
+    before, after = max(0, row - 1), min(len(times_s) - 1, row + 1)
+    interval_s = float(times_s[after] - times_s[before])
+    if not 0 < interval_s <= 2 * _CONSECUTIVE_S:
+        return None
+    return velocity_between(invert(poses[before]), invert(poses[after]), interval_s)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from slamdepth.errors import OutputError
+from slamdepth.geometry import rotation_to_quat_xyzw
 from slamdepth.io import encode_ply, replacing
 
 if TYPE_CHECKING:
@@ -66,13 +67,17 @@ class Mesh:
         length = np.linalg.norm(found, axis=1, keepdims=True)
         return np.asarray(np.divide(found, length, out=found, where=length > 0), np.float32)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, *, T_viewer_world: NDArray[np.float64] | None = None) -> None:
         """Write the mesh as binary PLY, OBJ or GLB, by the ending of ``path``.
 
         The file is written whole or not at all. PLY and OBJ keep the world frame (y down when the first
-        camera is level). GLB viewers expect y up, so its scene node turns the mesh by 180 degrees about x.
+        camera is level). GLB viewers expect y up, so its scene node turns the mesh.
         PLY has unit normals too, see :meth:`normals`. OBJ has the colours after the positions, as MeshLab
         and Open3D read them.
+
+        Args:
+            T_viewer_world: ``(4, 4)`` rotation of GLB's scene node. Default: 180 degrees about x, which is
+                right where the first camera was level.
 
         Raises:
             OutputError: the ending is none of these, or ``path`` cannot be written.
@@ -81,7 +86,10 @@ class Mesh:
         encode = _ENCODERS.get(path.suffix.lower())
         if encode is None:
             raise OutputError(f"{path}: a mesh file must end in one of {', '.join(_ENCODERS)}")
-        data = encode(self)
+        quat_xyzw = (1.0, 0.0, 0.0, 0.0)
+        if T_viewer_world is not None:
+            quat_xyzw = tuple(rotation_to_quat_xyzw(T_viewer_world[:3, :3]).tolist())
+        data = encode(self, quat_xyzw)
         with replacing(path) as temporary:
             temporary.write_bytes(data)
 
@@ -90,11 +98,14 @@ def _bytes_of(colors: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.round(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def _ply(mesh: Mesh) -> bytes:
+_Quaternion = tuple[float, ...]
+
+
+def _ply(mesh: Mesh, _: _Quaternion) -> bytes:
     return encode_ply(mesh.vertices_m, _bytes_of(mesh.colors), mesh.triangles, normals=mesh.normals())
 
 
-def _obj(mesh: Mesh) -> bytes:
+def _obj(mesh: Mesh, _: _Quaternion) -> bytes:
     colors = _bytes_of(mesh.colors) / 255.0
     lines = ["# vertices: x y z r g b"]
     lines += [
@@ -105,8 +116,8 @@ def _obj(mesh: Mesh) -> bytes:
     return ("\n".join(lines) + "\n").encode("ascii")
 
 
-def _glb(mesh: Mesh) -> bytes:
-    """Binary glTF 2.0: one primitive with vertex colours, shown unlit."""
+def _glb(mesh: Mesh, quat_xyzw: _Quaternion) -> bytes:
+    """Binary glTF 2.0: one primitive with vertex colours, shown unlit, turned by its node."""
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "slamdepth"}, "scene": 0}
     binary = b""
     if len(mesh.triangles) == 0:
@@ -129,7 +140,7 @@ def _glb(mesh: Mesh) -> bytes:
         document |= {
             "extensionsUsed": ["KHR_materials_unlit"],
             "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0, "rotation": [1.0, 0.0, 0.0, 0.0]}],  # half a turn about x: y up
+            "nodes": [{"mesh": 0, "rotation": list(quat_xyzw)}],
             "meshes": [
                 {"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}
             ],

@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 import logging.handlers
 import shlex
+import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slamdepth.errors import OutputError
+from slamdepth.export import is_export
 from slamdepth.io import writable, write_text
 from slamdepth.mapstore import remove_map
 from slamdepth.pipeline import checkpoint
@@ -49,10 +51,17 @@ MAPS_CONTENT = (
 )
 """What :data:`MAPS` holds."""
 
+EXPORTS = "export/"
+"""Folder of the exports: ``export/colmap/``, ..."""
+
+EXPORTS_CONTENT = "colmap/, tum/, ...: what --export or 'slamdepth export' wrote; each has a README.txt"
+"""What :data:`EXPORTS` holds."""
+
 _MAP_FILES = ("trajectory.txt", "keyframes.txt", "mesh.ply", "cloud.ply")
 
 _README = "README.txt"
 _MARK = "A run of slamdepth"
+_COMMAND = ("slamdepth", "run")
 
 
 @dataclass(frozen=True)
@@ -111,11 +120,11 @@ class RunFolder:
             with writing(self.path):
                 self._remove_files()
         width = max(map(len, FILES))
-        listed = {**FILES, f"{MAP}/": MAP_CONTENT, MAPS: MAPS_CONTENT}
-        lines = [f"{name:<{width}}  {what}" for name, what in listed.items()]
+        content = {**FILES, f"{MAP}/": MAP_CONTENT, MAPS: MAPS_CONTENT, EXPORTS: EXPORTS_CONTENT}
+        lines = [f"{name:<{width}}  {what}" for name, what in content.items()]
         head = f"{_MARK}. A file that is missing was not asked for, or the run was killed before it.\n\n"
         if arguments:
-            command = shlex.join(["slamdepth", "run", *arguments, "--config", str(self.path / "config.yaml")])
+            command = shlex.join([*_COMMAND, *arguments, "--config", str(self.path / "config.yaml")])
             lines += ["", "The same run again, from the folder this one was started in:", f"  {command}"]
         write_text(self.path / _README, head + "\n".join(lines) + "\n")
 
@@ -142,6 +151,12 @@ class RunFolder:
         """Remove our files; folders of maps only where nothing else is in them, and never through a link."""
         for name in FILES:
             (self.path / name).unlink(missing_ok=True)
+        exports = self.path / EXPORTS
+        if exports.is_dir() and not exports.is_symlink():
+            for folder in sorted(exports.iterdir()):
+                if is_export(folder):
+                    shutil.rmtree(folder)
+            _remove_if_empty(exports)
         remove_map(self.path / MAP)
         checkpoint.remove(self.path)
         maps = self.path / MAPS
@@ -198,11 +213,24 @@ def write_log_to(buffer: logging.handlers.MemoryHandler, path: Path, *, goes_on:
 
 
 def is_run(path: Path) -> bool:
-    """Whether a folder holds a run, finished or not."""
+    """True where ``path`` is the folder of a run, finished or not."""
     try:
         return (path / _README).read_text(encoding="utf-8").startswith(_MARK)
     except (OSError, UnicodeDecodeError):
         return False
+
+
+def recorded_arguments(path: Path) -> list[str]:
+    """The arguments of the command that made a run, the sequence first; none where its README has no command.
+
+    Relative paths are relative to the folder that the run was started in.
+    """
+    try:
+        lines = (path / _README).read_text(encoding="utf-8").splitlines()
+        words = [shlex.split(line) for line in lines if line.strip().startswith(" ".join(_COMMAND))]
+    except (OSError, ValueError):
+        return []
+    return words[-1][len(_COMMAND) :] if words else []
 
 
 def _remove_if_empty(folder: Path) -> None:

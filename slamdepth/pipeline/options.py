@@ -39,6 +39,7 @@ class RunOptions:
         map_images: keep images in the map.
         checkpoint_s: seconds from one checkpoint to the next; 0 writes none.
         reading: how the sequence is opened, such as the topic of a bag.
+        exports: formats that the result is exported to, see :func:`slamdepth.export_run`.
 
     Raises:
         ConfigError: ``stride`` or ``max_frames`` is below 1.
@@ -55,6 +56,7 @@ class RunOptions:
     map_images: bool = False
     checkpoint_s: float = CHECKPOINT_S
     reading: ReadOptions = field(default_factory=ReadOptions)
+    exports: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_frames_asked(self.stride, self.max_frames)
@@ -101,6 +103,7 @@ class RunStage(str, Enum):
     DRAWING = "drawing the mesh"
     SCORING = "scoring"
     COMPARING = "scoring the mesh"
+    EXPORTING = "exporting"
     REPORTING = "writing the report"
 
 
@@ -111,7 +114,7 @@ class RunProgress:
     Attributes:
         stage: what the run is doing.
         done, total: frames while tracking, fitting, looking for markers and scoring the mesh, keyframes
-            while meshing, steps of the work while measuring depth.
+            while meshing, images while exporting, steps of the work while measuring depth.
         fps: frames per second so far.
         status: of the last frame, None before the first.
         keyframes, loop_closures: totals so far.

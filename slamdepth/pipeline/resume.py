@@ -74,6 +74,7 @@ def _asked(
         for name in ("sequence", "camera_file", "start_map"):
             given[name] = None if given[name] is None else Path(given[name])
         given["reading"] = ReadOptions(**given["reading"])
+        given["exports"] = tuple(given["exports"])
         if sequence is not None:
             given["sequence"] = Path(sequence)
         options = RunOptions(output=path, **given)

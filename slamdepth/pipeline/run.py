@@ -7,6 +7,7 @@ import logging
 import random
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from logging.handlers import MemoryHandler
 from pathlib import Path
@@ -29,7 +30,10 @@ from slamdepth.mapstore import Map, Session
 from slamdepth.pipeline import checkpoint
 from slamdepth.pipeline.checkpoint import Checkpoints, Latest, SequenceKeyframes, begin
 from slamdepth.pipeline.dense import measure_depth
+from slamdepth.pipeline.export import check_exports, export_results
 from slamdepth.pipeline.folder import (
+    EXPORTS,
+    EXPORTS_CONTENT,
     FILES,
     MAP,
     MAP_CONTENT,
@@ -80,6 +84,7 @@ def run(
     map_images: bool = False,
     checkpoint_s: float | None = None,
     reading: ReadOptions | None = None,
+    export: Sequence[str] = (),
     progress: ProgressCallback | None = None,
     stop: threading.Event | None = None,
     watcher: Watcher | None = None,
@@ -106,6 +111,7 @@ def run(
         checkpoint_s: seconds from one checkpoint to the next, see :func:`slamdepth.resume`; 0 writes none.
             Default: 15.
         reading: how the sequence is opened, such as the topic of a bag.
+        export: formats to export the result to, into ``export/`` of the run folder; see :func:`export_run`.
         progress: called after each frame and at the start of each stage.
         stop: set it, from any thread or a signal handler, to finish early with the frames tracked so far.
         watcher: its ``saw(frame, result, tracker)`` is called after each frame, and must return at once.
@@ -131,6 +137,7 @@ def run(
         map_images,
         CHECKPOINT_S if checkpoint_s is None else checkpoint_s,
         reading or ReadOptions(),
+        tuple(export),
     )
     return run_job(options, _settings(config, depth), progress, stop, watcher=watcher)
 
@@ -218,6 +225,7 @@ def _prepare(
     """Open and check everything that a run needs, what costs least first."""
     from slamdepth.tracking import create_tracker
 
+    check_exports(options.exports)
     config = with_chosen_model(config)
     start_map = None if options.start_map is None else Map.load(options.start_map)
     dataset = open_dataset(options.sequence, options.camera_file, options.reading)
@@ -375,6 +383,15 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     )
     notes += other_notes
 
+    notes += export_results(
+        folder,
+        dataset,
+        (reconstruction, *(one.reconstruction for one in others)),
+        (scale_facts.sentence, *(one.scale.sentence for one in others)),
+        job.options.exports,
+        tell,
+    )
+
     tell(RunProgress(RunStage.SCORING))
     trajectory_score, score_notes = judge_trajectory(
         dataset, reconstruction.trajectory, is_measured=is_measured
@@ -400,6 +417,8 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     files = {name: what for name, what in FILES.items() if name not in absent}
     if (folder / MAP).is_dir():
         files[f"{MAP}/"] = MAP_CONTENT
+    files |= {MAPS: MAPS_CONTENT} if others else {}
+    files |= {EXPORTS: EXPORTS_CONTENT} if (folder / EXPORTS).is_dir() else {}
     tell(RunProgress(RunStage.REPORTING))
     scene = scene_of(
         replace(reconstruction, others=tuple(one.reconstruction for one in others)),
@@ -432,7 +451,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
             promised_frames=getattr(dataset, "frames_promised", len(dataset)),
             notes=(*notes, *score_notes, *depth_notes, *surface_notes),
             options=_reported_options(job.options, tracked),
-            files=files | ({MAPS: MAPS_CONTENT} if others else {}),
+            files=files,
         ),
     )
     logger.info("done: %s", folder.path)
@@ -478,6 +497,8 @@ def _arguments(options: RunOptions) -> list[str]:
         arguments += ["--max-frames", str(options.max_frames)]
     if options.stride != 1:
         arguments += ["--stride", str(options.stride)]
+    if options.exports:
+        arguments += ["--export", ",".join(options.exports)]
     if options.start_map is not None:
         arguments += ["--map", str(options.start_map)]
     if options.map_images:

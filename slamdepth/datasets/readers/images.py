@@ -85,13 +85,16 @@ class FolderSequence(ImageSequence):
             CameraError: its size is not that of the camera it was taken by.
         """
         del with_depth
+        image_rgb = reduced_image(self.read_original(index).image_rgb, self.camera)
+        return Frame(index, float(self.timestamps_s[index]), image_rgb, self.camera)
+
+    def read_original(self, index: int) -> Frame:
+        """Read one frame in its own size; raises as :meth:`read`."""
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         image_rgb = read_image_rgb(self.image_paths[index])
         check_size(self.image_paths[index], image_rgb.shape, self._taken_by)
-        return Frame(
-            index, float(self.timestamps_s[index]), reduced_image(image_rgb, self.camera), self.camera
-        )
+        return Frame(index, float(self.timestamps_s[index]), image_rgb, self._taken_by)
 
 
 def _check_names(path: Path, images: tuple[Path, ...]) -> None:

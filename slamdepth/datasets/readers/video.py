@@ -78,6 +78,7 @@ class VideoSequence(Dataset):
         self.frames_promised = video.frames_named if missing else len(self)
         self.notes += [missing] if missing else []
         self.camera = replace(reduced_camera(camera, self.notes), fps=video.fps)
+        self._taken_by = replace(camera, fps=video.fps)
         self._video = video
         self._lock = threading.Lock()
         self._frames = video.frames()
@@ -94,11 +95,20 @@ class VideoSequence(Dataset):
             ImageDecodeError: the frame does not decode.
         """
         del with_depth
+        image_rgb = self._read(index, self.camera)
+        return Frame(index, float(self.timestamps_s[index]), image_rgb, self.camera)
+
+    def read_original(self, index: int) -> Frame:
+        """Read one frame in the video's own size; raises as :meth:`read`."""
+        image_rgb = self._read(index, self._taken_by)
+        return Frame(index, float(self.timestamps_s[index]), image_rgb, self._taken_by)
+
+    def _read(self, index: int, camera: Camera) -> NDArray[np.uint8]:
+        """The image ``(H, W, 3)`` of a frame in the size of ``camera``."""
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
-        with self._lock:
-            image_rgb = self._decoded(index)
-        return Frame(index, float(self.timestamps_s[index]), image_rgb, self.camera)
+        with self._lock:  # the decoder's buffer holds the frame until the next one is taken
+            return reduced_image(self._decoded(index), camera)
 
     def _decoded(self, index: int) -> NDArray[np.uint8]:
         if index < self._next:
@@ -106,5 +116,5 @@ class VideoSequence(Dataset):
         for number, decode in self._frames:
             self._next = number + 1
             if number == index:
-                return reduced_image(decode(), self.camera)
+                return decode()
         raise ImageDecodeError(f"{self.path.name}: the video ends before frame {index}")

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An export's folder: written whole or not at all, with a README."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+from slamdepth.errors import OutputError
+from slamdepth.export.images import ImageMode
+from slamdepth.export.registry import ExportRequest, export_format
+from slamdepth.io import writable, write_text
+
+README = "README.txt"
+_MARK = "An export of slamdepth"
+
+
+def write_export(request: ExportRequest, name: str, folder: Path, *, overwrite: bool = False) -> Path:
+    """Write a scene in the format called ``name`` into ``folder``.
+
+    Args:
+        overwrite: an earlier export in ``folder`` may be replaced.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ConfigError: there is no such format, or a package that it needs is missing.
+        InputError: the run lacks what the format needs.
+        OutputError: the folder holds something else, or cannot be written.
+    """
+    kind = export_format(name)
+    folder = check_place(folder, overwrite=overwrite)
+    folder = folder.absolute()
+    partial = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.partial")
+    try:
+        try:
+            partial.mkdir(parents=True)
+            lines = kind.write(request, partial)
+            write_text(partial / README, _readme(request, name, kind.about, kind.has_images, lines))
+            if is_export(folder):
+                shutil.rmtree(folder)
+            os.replace(partial, folder)  # an empty folder may be there
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):
+            shutil.rmtree(partial)
+    return folder
+
+
+def check_place(folder: Path, *, overwrite: bool = False) -> Path:
+    """``folder``, if an export can be written there.
+
+    Raises:
+        OutputError: it is a file, holds something already, or cannot be written.
+    """
+    folder = folder.expanduser()
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; name a folder for the export")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not is_export(folder):
+            raise OutputError(f"{folder}: is not empty and holds no earlier export; name a new folder")
+        if not overwrite:
+            raise OutputError(f"{folder}: holds an earlier export; name another folder or add --overwrite")
+    return writable(folder)
+
+
+def is_export(folder: Path) -> bool:
+    """True where ``folder`` holds what :func:`write_export` wrote."""
+    try:
+        is_ours = (folder / README).read_text(encoding="utf-8").startswith(_MARK)
+    except (OSError, UnicodeDecodeError):
+        return False
+    return is_ours and not folder.is_symlink()
+
+
+def _readme(request: ExportRequest, name: str, about: str, has_images: bool, lines: tuple[str, ...]) -> str:
+    scene = request.scene
+    text = [f"{_MARK} of '{scene.name}' to {name}: {about}.", "", *lines, ""]
+    if has_images:
+        text += [_IMAGES[request.mode], ""]
+    if scene.gravity_w is None:
+        gravity = "The direction of gravity is not known."
+    else:
+        gravity = "Gravity in the world frame: " + " ".join(f"{x:.6f}" for x in scene.gravity_w) + "."
+    text += [
+        "World frame of the run: that of its first camera, x right, y down, z forward. " + gravity,
+        f"Unit: metres of the run. Scale: {scene.scale}",
+    ]
+    return "\n".join(text) + "\n"
+
+
+_IMAGES = {
+    ImageMode.UNDISTORTED: "Images: without lens distortion and, where the run found one, rolling shutter; "
+    "cropped to where every pixel has a source. The camera is a pinhole.",
+    ImageMode.RAW: "Images: as they were taken. The camera has the lens distortion; a rolling shutter is not "
+    "corrected.",
+    ImageMode.NONE: "Images: none; the camera is that of undistorted images.",
+}
