@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, print_notes, print_places
-from slamdepth.cli.options import CameraOption, DepthWeightsOption, MaxFramesOption, StrideOption
+from slamdepth.cli.options import (
+    CameraOption,
+    DepthWeightsOption,
+    FovOption,
+    MaxFramesOption,
+    StrideOption,
+)
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
 
@@ -106,6 +112,7 @@ def run_command(
         ),
     ] = False,
     camera: CameraOption = None,
+    fov: FovOption = None,
     readout_ms: Annotated[
         float | None,
         typer.Option(
@@ -186,6 +193,7 @@ def run_command(
             sequence,
             output,
             camera=camera,
+            view_deg=fov,
             config=settings,
             max_frames=max_frames,
             stride=stride,

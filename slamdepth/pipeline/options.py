@@ -22,13 +22,14 @@ class RunOptions:
         sequence: a video or the folder of a sequence.
         output: run folder; None makes ``runs/<sequence>-<time>``.
         camera_file: a ``camera.yaml`` that overrules what the sequence says.
+        view_deg: field of view across the longer side of an image, which overrules it too.
         max_frames: stop after this many frames; None reads all.
         stride: take every Nth frame.
         mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
         overwrite: an earlier run in ``output`` may be replaced.
 
     Raises:
-        ConfigError: ``stride`` or ``max_frames`` is below 1.
+        ConfigError: ``stride`` or ``max_frames`` is below 1, or both a camera file and a view are given.
     """
 
     sequence: Path
@@ -38,9 +39,12 @@ class RunOptions:
     stride: int = 1
     mesh: bool = True
     overwrite: bool = False
+    view_deg: float | None = None
 
     def __post_init__(self) -> None:
         check_frames_asked(self.stride, self.max_frames)
+        if self.camera_file is not None and self.view_deg is not None:
+            raise ConfigError("a camera file and a field of view exclude each other")
 
     def indices(self, frames: int) -> range:
         """Which of ``frames`` frames are read, in order."""
@@ -63,6 +67,7 @@ def check_frames_asked(stride: int, max_frames: int | None) -> None:
 class RunStage(str, Enum):
     """What a run is doing."""
 
+    CALIBRATING = "finding the focal length"
     SCALING = "fitting the scale"
     TRACKING = "tracking"
     OPTIMISING = "optimising"

@@ -23,6 +23,7 @@ from slamdepth.errors import DatasetError, OutputError, SlamdepthError
 from slamdepth.frontend.features import feature_weights
 from slamdepth.io import write_text
 from slamdepth.mapping.mesh import Mesh
+from slamdepth.pipeline.camera import OpeningCamera, check_camera, settle_camera, use_view
 from slamdepth.pipeline.dense import measure_depth
 from slamdepth.pipeline.folder import FILES, MAPS, MAPS_CONTENT, RunFolder, run_log, write_log_to
 from slamdepth.pipeline.maps import finish_others, settle_others, write_mesh, write_trajectories
@@ -53,6 +54,7 @@ def run(
     *,
     depth: str | None = None,
     camera: str | Path | None = None,
+    view_deg: float | None = None,
     config: Config | str | Path | None = None,
     max_frames: int | None = None,
     stride: int = 1,
@@ -71,7 +73,10 @@ def run(
         output: run folder. Default: ``runs/<sequence>-<time>``.
         depth: name of the depth model, see :func:`slamdepth.create_depth_model`; ``"sensor"`` takes the
             sequence's own depth. Default: as ``config`` says, which is ``"auto"`` unless changed.
-        camera: a ``camera.yaml`` with the intrinsics. Default: as the sequence says.
+        camera: a ``camera.yaml`` with the intrinsics. Default: as the sequence says; where it does not,
+            they are found from the motion.
+        view_deg: field of view in degrees across the longer side of an image, about which the focal length
+            is looked for; instead of ``camera``.
         config: every other setting, or a YAML file with settings. Default: ``Config()``.
         max_frames: stop after this many frames. Default: all.
         stride: take every Nth frame.
@@ -97,6 +102,7 @@ def run(
         stride,
         mesh,
         overwrite,
+        view_deg,
     )
     settings = _settings(config, depth)
     tell = progress or (lambda state: None)
@@ -114,6 +120,7 @@ class _Job:
 
     Attributes:
         indices: which frames of the dataset are tracked.
+        camera: how the camera was found.
         model: the depth model as the tracker gets it, scaled where that was asked for.
     """
 
@@ -122,6 +129,7 @@ class _Job:
     dataset: Dataset
     indices: range
     folder: RunFolder
+    camera: OpeningCamera
     model: DepthModel
     scale: PredictionScale
     tracker: AnyTracker
@@ -146,6 +154,8 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
 
     config = with_chosen_model(config)
     dataset = open_dataset(options.sequence, options.camera_file)
+    if options.view_deg is not None:
+        use_view(dataset, options.view_deg)
     indices = options.indices(len(dataset))
     check_scale_options(dataset, config, indices)
     folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite)
@@ -157,6 +167,9 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
                 f"{dataset.path}: {lack_of_depth(dataset)}; run it with predicted depth: --depth dinov2"
             )
         dataset.notes += check_sensor_depth(dataset, indices)
+    camera = settle_camera(dataset, indices, given, config, tell, stop)
+    if camera.prior is not None:
+        seed_everything(config.seed)
     scale = choose_prediction_scale(
         dataset,
         given,
@@ -168,7 +181,7 @@ def _prepare(options: RunOptions, config: Config, tell: ProgressCallback, stop: 
     model = scale.applied_to(given)
     seed_torch(config.seed)
     tracker = create_tracker(dataset.camera, depth_model=model, config=config)
-    return _Job(options, config, dataset, indices, folder, model, scale, tracker)
+    return _Job(options, config, dataset, indices, folder, camera, model, scale, tracker)
 
 
 def _track(job: _Job, log: MemoryHandler, tell: ProgressCallback, stop: threading.Event) -> Tracked:
@@ -212,6 +225,8 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     reconstruction, scale_facts, scale_notes = settle_scale(
         dataset, tracked.reconstruction, scale, config, tell
     )
+    sights = job.tracker.sights() if job.camera.prior is not None else None
+    camera = check_camera(dataset, job.camera, sights)
     others, other_notes = settle_others(dataset, tracked.reconstruction, scale, config)
     reconstruction = replace(reconstruction, others=tuple(one.reconstruction for one in others))
     write_trajectories(folder, (reconstruction, *reconstruction.others))
@@ -268,7 +283,15 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
             fps=tracked.fps,
             config=config,
             scale=scale_facts,
-            health=judge_health(reconstruction, tracked.steps, config, scale_facts, is_measured=is_measured),
+            health=judge_health(
+                reconstruction,
+                tracked.steps,
+                config,
+                scale_facts,
+                is_measured=is_measured,
+                camera_is_guessed=not camera.is_given and not camera.is_observed,
+            ),
+            camera=camera,
             weights=(*job.model.weights, *feature_weights(config.features)),
             steps=tracked.steps,
             trajectory_score=trajectory_score,
@@ -318,6 +341,8 @@ def _arguments(options: RunOptions) -> list[str]:
     arguments = [str(options.sequence)]
     if options.camera_file is not None:
         arguments += ["--camera", str(options.camera_file)]
+    if options.view_deg is not None:
+        arguments += ["--fov", f"{options.view_deg:g}"]
     if options.max_frames is not None:
         arguments += ["--max-frames", str(options.max_frames)]
     if options.stride != 1:

@@ -146,6 +146,9 @@ class CloudTracker:
             timings_ms=timings_ms,
         )
 
+    def sights(self) -> None:
+        """Nothing: registration of clouds sees no landmarks."""
+
     def close(self) -> None:
         """End the odometry; there are no threads to be ended."""
         self._finished = True

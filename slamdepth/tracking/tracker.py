@@ -7,6 +7,7 @@ from types import TracebackType
 
 import numpy as np
 
+from slamdepth.backend.sights import Sights
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.metric import metric_model
@@ -24,6 +25,7 @@ from slamdepth.tracking.finish import finish_run
 from slamdepth.tracking.frame_log import check_frame
 from slamdepth.tracking.map_parts import RunParts
 from slamdepth.tracking.map_tracker import MapTracker, Placed
+from slamdepth.tracking.self_calibration import sights_of
 from slamdepth.tracking.workers import DepthWorker, Workers
 from slamdepth.types import Camera, Frame, StepResult, TrackingStatus
 
@@ -171,6 +173,18 @@ class Tracker:
         self._watch.next_frame()
         with self, single_threaded():
             return finish_run(self._atlas, self.config, self._watch, self._steps)
+
+    def sights(self) -> Sights | None:
+        """What the maps see, to find the camera by (:mod:`slamdepth.backend.self_calibration`).
+
+        Returns:
+            None where that is too little. No frame may follow.
+        """
+        if not self._finished:
+            self._workers.between.wait()
+            with single_threaded():
+                self._active.integration.run_all()
+        return sights_of(self._atlas.maps, self.camera)
 
     def close(self) -> None:
         """End the tracker's threads; :meth:`finish` does so too."""
