@@ -102,8 +102,8 @@ class System:
         """Of the shared unknowns: with errors in groups, and with independent ones; ``(S, S)`` each."""
         S, Z, blocks = self._reduced(0.0)
         images = 6 * self._images
-        inverse = np.linalg.inv(S)[images:]
-        naive: Floats = inverse[:, images:]
+        inverse: Floats = np.asarray(np.linalg.inv(S), dtype=np.float64)[images:]
+        naive = inverse[:, images:]
         # influence of each residual on the shared unknowns, which all other unknowns follow
         influence = np.asarray(inverse @ (self._J - self._Jp @ (blocks.T @ Z.T)).T)
         each = np.einsum("snj,nj->ns", influence.reshape(len(naive), -1, 2), self._r)
@@ -122,7 +122,7 @@ class System:
         Hpp = self._Hpp.copy()
         diagonal = np.arange(3)
         Hpp[:, diagonal, diagonal] *= 1.0 + damping
-        M = np.linalg.inv(np.linalg.cholesky(Hpp))
+        M: Floats = np.linalg.inv(np.linalg.cholesky(Hpp))
         blocks = bsr_matrix((M, np.arange(points), np.arange(points + 1)), shape=(3 * points, 3 * points))
         Z = (self._cross @ blocks.T).tocsr()
         S = self._H - (Z @ Z.T).toarray()

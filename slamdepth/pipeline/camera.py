@@ -31,11 +31,13 @@ logger = logging.getLogger(__name__)
 GUESSED_SIGMA = 0.35
 """Deviation of the logarithm of a guessed focal length: cameras see from about 35 to 95 degrees."""
 
-_WINDOW = 150  # frames: the first seconds of a video
+WINDOW = 150
+"""Frames of a window: the first seconds of a video."""
+
 _PLACES = (0.0, 0.5, 0.25, 0.75, 0.0)  # of the windows, as shares of what is left of the recording
 _FEWEST_PASSES = 2
 _SETTLED = 0.01  # change of log f between two passes
-_SURE = 0.01  # deviation of log f after which further windows are not worth their time
+_SURE = 0.02  # deviation of log f after which further windows are not worth their time
 _SAME_CAMERA = 0.03  # windows tracked with a camera farther off say little
 _OBSERVED = 0.1  # a larger deviation of log f is no measurement
 _READOUT_SIGMA_S = 0.01
@@ -86,18 +88,18 @@ def settle_camera(
     if source.certainty is Certainty.GIVEN:
         return OpeningCamera(source)
     guess = dataset.camera
-    sigma = source.sigma_log_f if source.certainty is Certainty.NOMINAL else GUESSED_SIGMA
+    prior = prior_of(guess.fx, source, config)
+    sigma = prior.sigma_log_f
     logger.warning("intrinsics are not given: %s", source.how)
     if config.odometry != "orb" or getattr(dataset, "is_live", False):
         return OpeningCamera(source, None, sigma)
-    prior = _prior(guess.fx, sigma, config)
     passes: list[tuple[float, Sights]] = []
     settled: tuple[SelfCalibration, float] | None = None
     for n, place in enumerate(_PLACES):
-        start = round(place * max(0, len(indices) - _WINDOW))
-        window = indices[start : start + _WINDOW]
+        start = round(place * max(0, len(indices) - WINDOW))
+        window = indices[start : start + WINDOW]
         tell(RunProgress(RunStage.CALIBRATING, n, len(_PLACES)))
-        sights = _tracked(dataset, window, model, config, stop)
+        sights = sights_of_window(dataset, window, model, config, stop)
         if stop.is_set():
             break
         if sights is None:
@@ -110,7 +112,8 @@ def settle_camera(
         )  # fmt: skip
         settled = (found, math.hypot(found.sigma_log_f, change))
         dataset.camera = found.camera
-        if n + 1 >= _FEWEST_PASSES and change < _SETTLED and found.sigma_log_f < _SURE:
+        has_settled = change < max(_SETTLED, found.sigma_log_f) and found.sigma_log_f < _SURE
+        if n + 1 >= _FEWEST_PASSES and has_settled:
             break
     if settled is not None and settled[1] < _OBSERVED:
         return OpeningCamera(source, prior, settled[1])
@@ -147,7 +150,9 @@ def check_camera(dataset: Dataset, opening: OpeningCamera, sights: Sights | None
     return facts
 
 
-def _prior(focal_px: float, sigma: float, config: Config) -> Prior:
+def prior_of(focal_px: float, source: CameraSource, config: Config) -> Prior:
+    """What is known of a camera whose focal length was named or guessed to be ``focal_px``."""
+    sigma = source.sigma_log_f if source.certainty is Certainty.NOMINAL else GUESSED_SIGMA
     readout_s = _READOUT_SIGMA_S if config.shutter.readout_ms is None else 0.0
     return Prior(focal_px, sigma, readout_s=readout_s)
 
@@ -162,7 +167,7 @@ def _adjusted(
     return found, abs(math.log(found.camera.fx) - latest)
 
 
-def _tracked(
+def sights_of_window(
     dataset: Dataset, window: Sequence[int], model: DepthModel, config: Config, stop: threading.Event
 ) -> Sights | None:
     """What a tracker sees in some frames, with the dataset's camera as it is now."""
