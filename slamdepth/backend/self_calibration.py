@@ -144,8 +144,11 @@ class _Solver:
         for _ in range(limit):
             system = self._system(state, keep)
             for _ in range(6):
-                candidate = self._moved(state, system, damping)
-                new = self._cost(candidate, keep)
+                try:
+                    candidate = self._moved(state, system, damping)
+                    new = self._cost(candidate, keep)
+                except np.linalg.LinAlgError:  # the equations are singular at this damping
+                    new = np.inf
                 if np.isfinite(new) and new < cost:
                     break
                 damping *= 10.0

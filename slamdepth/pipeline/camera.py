@@ -40,6 +40,8 @@ _SETTLED = 0.01  # change of log f between two passes
 _SURE = 0.02  # deviation of log f after which further windows are not worth their time
 _SAME_CAMERA = 0.03  # windows tracked with a camera farther off say little
 _OBSERVED = 0.1  # a larger deviation of log f is no measurement
+_TOLD = 0.7  # of the deviation without the motion: one that is hardly smaller is not the motion's
+_MODEL_SIGMA = 0.01  # of log f: what two coefficients, the centre and square pixels leave of real lenses
 _READOUT_SIGMA_S = 0.01
 
 
@@ -110,13 +112,14 @@ def settle_camera(
             "pass %d: focal length %.1f px +- %.1f %%, k1 %.3f, before %.1f px",
             n + 1, found.camera.fx, 100 * found.sigma_log_f, found.camera.distortion[0], dataset.camera.fx,
         )  # fmt: skip
-        settled = (found, math.hypot(found.sigma_log_f, change))
+        settled = (found, math.hypot(found.sigma_log_f, change, _MODEL_SIGMA))
         dataset.camera = found.camera
         has_settled = change < max(_SETTLED, found.sigma_log_f) and found.sigma_log_f < _SURE
         if n + 1 >= _FEWEST_PASSES and has_settled:
             break
-    if settled is not None and settled[1] < _OBSERVED:
+    if settled is not None and _is_observed(settled[1], prior):
         return OpeningCamera(source, prior, settled[1])
+    logger.warning("the motion of the first windows does not show the focal length")
     dataset.camera = guess
     return OpeningCamera(source, prior, sigma)
 
@@ -132,16 +135,16 @@ def check_camera(dataset: Dataset, opening: OpeningCamera, sights: Sights | None
         return CameraFacts(camera, opening.source, sigma_log_f=opening.sigma_log_f)
     found = self_calibrate(sights, camera, opening.prior)
     change = math.log(found.camera.fx / camera.fx)
-    sigma = math.hypot(found.sigma_log_f, change)
-    is_observed = sigma < _OBSERVED
+    sigma = math.hypot(found.sigma_log_f, change, _MODEL_SIGMA)
+    is_observed = _is_observed(sigma, opening.prior)
     logger.info(
         "final map: focal length %.1f px +- %.1f %%, tracked with %.1f px",
         found.camera.fx, 100 * found.sigma_log_f, camera.fx,
     )  # fmt: skip
     if not is_observed:
-        sigma = max(sigma, opening.sigma_log_f or 0.0)
+        sigma = opening.prior.sigma_log_f
     facts = CameraFacts(camera, opening.source, found.camera, sigma, found.sigma_k1, is_observed)
-    if abs(change) > _SAME_CAMERA:
+    if is_observed and abs(change) > _SAME_CAMERA:
         dataset.notes.append(
             f"the whole recording shows a focal length of {found.camera.fx:.1f} px, its first windows "
             f"{camera.fx:.1f} px, which was used: give --fov or --camera"
@@ -155,6 +158,11 @@ def prior_of(focal_px: float, source: CameraSource, config: Config) -> Prior:
     sigma = source.sigma_log_f if source.certainty is Certainty.NOMINAL else GUESSED_SIGMA
     readout_s = _READOUT_SIGMA_S if config.shutter.readout_ms is None else 0.0
     return Prior(focal_px, sigma, readout_s=readout_s)
+
+
+def _is_observed(sigma: float, prior: Prior) -> bool:
+    """Whether a deviation of log f is the motion's rather than that of what was known before."""
+    return sigma < min(_OBSERVED, _TOLD * prior.sigma_log_f)
 
 
 def _adjusted(

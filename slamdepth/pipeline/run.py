@@ -289,7 +289,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
                 config,
                 scale_facts,
                 is_measured=is_measured,
-                camera_is_guessed=not camera.is_given and not camera.is_observed,
+                camera_is_guessed=camera.is_a_guess,
             ),
             camera=camera,
             weights=(*job.model.weights, *feature_weights(config.features)),

@@ -48,7 +48,14 @@ class CameraFacts:
             return self.source.how
         if self.is_observed:
             return f"found from the motion; at first {self.source.how}"
+        if self.source.certainty is Certainty.NOMINAL:
+            return f"{self.source.how}; the motion shows it no better"
         return f"{self.source.how}; {NOT_OBSERVABLE}"
+
+    @property
+    def is_a_guess(self) -> bool:
+        """Whether nothing but a guess tells the focal length."""
+        return self.source.certainty is Certainty.GUESSED and not self.is_observed
 
     @property
     def sentence(self) -> str:
