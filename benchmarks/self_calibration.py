@@ -6,9 +6,9 @@
 
 Each recording is tracked from a guess of 60 degrees, as ``slamdepth run`` does without a camera file: error
 of the focal length and of its interval, and Sim(3) error of the path, of each piece of the truth. With
---windows, so many stretches of 150 frames of each recording are adjusted by themselves, from the known camera:
-how many errors are within one and two deviations. The kitchen's published 585 px are those of its depth
-camera, and 532 px fit its colour images better; errors are against the latter.
+--windows, so many stretches of 150 frames of each recording are adjusted by themselves, from the known
+camera: how many errors are within one and two deviations. The kitchen's published 585 px are those of its
+depth camera, and 532 px fit its colour images better; errors are against the latter.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def run(recording: Recording, frames: int | None) -> dict[str, Any]:
             for index in indices:
                 tracker.step(dataset.read(index))
             found = tracker.finish()
-        facts = check_camera(dataset, opening, tracker.sights())
+        facts = check_camera(dataset, opening, tracker)
     except SlamdepthError as error:
         return {"error": str(error)}
     return {
@@ -156,8 +156,8 @@ def _run_cells(row: dict[str, Any]) -> list[str]:
     ate = ", ".join(f"{rmse:.4f}" for rmse in row["ate_m"])
     return [
         row["sequence"], f"{row['true_px']:.1f}", f"{row['found_px']:.1f}{observed}",
-        f"{100 * row['error']:+.2f}", f"{100 * row['sigma']:.2f}", f"{row['tracked_px']:.1f}", ate or "-", f"{100 * row['tracked']:.0f} %",
-        f"{row['opening_s']:.0f}",
+        f"{100 * row['error']:+.2f}", f"{100 * row['sigma']:.2f}", f"{row['tracked_px']:.1f}", ate or "-",
+        f"{100 * row['tracked']:.0f} %", f"{row['opening_s']:.0f}",
     ]  # fmt: skip
 
 

@@ -77,9 +77,6 @@ class MadeUpTracker:
         status = TrackingStatus.LOST if is_lost else TrackingStatus.TRACKING
         return StepResult(frame.index, frame.timestamp_s, status, None if is_lost else pose(frame.index))
 
-    def sights(self) -> None:
-        """Nothing was seen."""
-
     def __enter__(self) -> MadeUpTracker:
         return self
 

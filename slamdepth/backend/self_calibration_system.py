@@ -103,7 +103,7 @@ class System:
         S, Z, blocks = self._reduced(0.0)
         images = 6 * self._images
         inverse: Floats = np.asarray(np.linalg.inv(S), dtype=np.float64)[images:]
-        naive = inverse[:, images:]
+        naive: Floats = inverse[:, images:]
         # influence of each residual on the shared unknowns, which all other unknowns follow
         influence = np.asarray(inverse @ (self._J - self._Jp @ (blocks.T @ Z.T)).T)
         each = np.einsum("snj,nj->ns", influence.reshape(len(naive), -1, 2), self._r)
@@ -111,7 +111,7 @@ class System:
         by_point, by_image = _in_groups(each, self._point), _in_groups(each, self._camera)
         both = by_point + by_image - each.T @ each
         # the difference may come out too small by chance
-        grouped = max(both, by_point, by_image, key=lambda one: float(one[0, 0]))
+        grouped: Floats = max((both, by_point, by_image), key=lambda one: float(one[0, 0]))
         return grouped + of_prior, naive
 
     def _reduced(self, damping: float) -> tuple[Floats, Any, Any]:

@@ -41,7 +41,7 @@ _SURE = 0.02  # deviation of log f after which further windows are not worth the
 _SAME_CAMERA = 0.03  # windows tracked with a camera farther off say little
 _OBSERVED = 0.1  # a larger deviation of log f is no measurement
 _TOLD = 0.7  # of the deviation without the motion: one that is hardly smaller is not the motion's
-_MODEL_SIGMA = 0.01  # of log f: what two coefficients, the centre and square pixels leave of real lenses
+_MODEL_SIGMA = 0.02  # of log f: errors of windows of seven recordings beyond what their residuals tell
 _READOUT_SIGMA_S = 0.01
 
 
@@ -124,13 +124,16 @@ def settle_camera(
     return OpeningCamera(source, prior, sigma)
 
 
-def check_camera(dataset: Dataset, opening: OpeningCamera, sights: Sights | None) -> CameraFacts:
+def check_camera(dataset: Dataset, opening: OpeningCamera, tracker: object) -> CameraFacts:
     """The camera as the final map shows it.
 
     Args:
-        sights: of the tracker, after it has finished; None where it has none.
+        tracker: of the run, after it has finished.
     """
+    from slamdepth.tracking.tracker import sights_seen
+
     camera = dataset.camera
+    sights = None if opening.prior is None else sights_seen(tracker)
     if opening.prior is None or sights is None:
         return CameraFacts(camera, opening.source, sigma_log_f=opening.sigma_log_f)
     found = self_calibrate(sights, camera, opening.prior)
@@ -179,7 +182,7 @@ def sights_of_window(
     dataset: Dataset, window: Sequence[int], model: DepthModel, config: Config, stop: threading.Event
 ) -> Sights | None:
     """What a tracker sees in some frames, with the dataset's camera as it is now."""
-    from slamdepth.tracking import Tracker
+    from slamdepth.tracking.tracker import Tracker, sights_seen
 
     tracker = Tracker(dataset.camera, model, config)
     reader = FramePrefetcher(dataset, window, with_depth=is_sensor(model), prepare=tracker.prepare)
@@ -190,4 +193,4 @@ def sights_of_window(
                     return None
                 if not isinstance(item, ImageDecodeError):
                     tracker.step(item.frame, item.prepared)
-        return tracker.sights()
+        return sights_seen(tracker)

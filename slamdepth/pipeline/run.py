@@ -225,8 +225,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     reconstruction, scale_facts, scale_notes = settle_scale(
         dataset, tracked.reconstruction, scale, config, tell
     )
-    sights = job.tracker.sights() if job.camera.prior is not None else None
-    camera = check_camera(dataset, job.camera, sights)
+    camera = check_camera(dataset, job.camera, job.tracker)
     others, other_notes = settle_others(dataset, tracked.reconstruction, scale, config)
     reconstruction = replace(reconstruction, others=tuple(one.reconstruction for one in others))
     write_trajectories(folder, (reconstruction, *reconstruction.others))

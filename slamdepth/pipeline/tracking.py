@@ -12,7 +12,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
-from slamdepth.backend.sights import Sights
 from slamdepth.datasets import Dataset
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import TrajectoryWriter
@@ -34,8 +33,6 @@ class AnyTracker(Protocol):
     def step(self, frame: Frame, prepared: Any = None) -> StepResult: ...
 
     def finish(self) -> Reconstruction: ...
-
-    def sights(self) -> Sights | None: ...
 
     def __enter__(self) -> Any: ...
 

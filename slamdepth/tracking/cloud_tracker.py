@@ -146,9 +146,6 @@ class CloudTracker:
             timings_ms=timings_ms,
         )
 
-    def sights(self) -> None:
-        """Nothing: registration of clouds sees no landmarks."""
-
     def close(self) -> None:
         """End the odometry; there are no threads to be ended."""
         self._finished = True

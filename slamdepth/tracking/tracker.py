@@ -174,18 +174,6 @@ class Tracker:
         with self, single_threaded():
             return finish_run(self._atlas, self.config, self._watch, self._steps)
 
-    def sights(self) -> Sights | None:
-        """What the maps see, to find the camera by (:mod:`slamdepth.backend.self_calibration`).
-
-        Returns:
-            None where that is too little. No frame may follow.
-        """
-        if not self._finished:
-            self._workers.between.wait()
-            with single_threaded():
-                self._active.integration.run_all()
-        return sights_of(self._atlas.maps, self.camera)
-
     def close(self) -> None:
         """End the tracker's threads; :meth:`finish` does so too."""
         self._finished = True
@@ -198,6 +186,24 @@ class Tracker:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def sights_seen(tracker: object) -> Sights | None:
+    """What the maps of a tracker see, to find the camera by (:mod:`slamdepth.backend.self_calibration`).
+
+    Args:
+        tracker: no frame may follow.
+
+    Returns:
+        None where that is too little, or the tracker has no landmarks.
+    """
+    if not isinstance(tracker, Tracker):
+        return None
+    if not tracker._finished:
+        tracker._workers.between.wait()
+        with single_threaded():
+            tracker._active.integration.run_all()
+    return sights_of(tracker._atlas.maps, tracker.camera)
 
 
 def _load_libraries() -> None:
