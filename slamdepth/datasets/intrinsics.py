@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 from enum import Enum
@@ -12,6 +13,8 @@ from slamdepth.calibration import CAMERA_FILE
 from slamdepth.datasets.quicktime import video_focal_35mm
 from slamdepth.errors import CameraError
 from slamdepth.types import Camera
+
+_log = logging.getLogger(__name__)
 
 GUESSED_VIEW_DEG = 60.0
 """Field of view across the longer side where nothing is known: between a phone's main camera
@@ -100,16 +103,14 @@ def intrinsics_of(width: int, height: int, focal_35mm: float | None = None) -> I
 
 def intrinsics_of_images(path: Path, width: int, height: int) -> tuple[Camera, CameraSource]:
     """The camera of images like ``path``, of this upright size, without a camera file: by EXIF or a guess."""
-    found = intrinsics_of(width, height, exif_focal_35mm(path))
-    return found.camera, CameraSource(found.certainty, found.how)
+    return _named(path, intrinsics_of(width, height, exif_focal_35mm(path)))
 
 
 def intrinsics_of_video(path: Path, width: int, height: int) -> tuple[Camera, CameraSource]:
     """The camera of a video of this upright size without a camera file: by its metadata or a guess."""
     focal_35mm = video_focal_35mm(path)
     if focal_35mm is None:
-        found = intrinsics_of(width, height)
-        return found.camera, CameraSource(found.certainty, found.how)
+        return _named(path, intrinsics_of(width, height))
     focal_px = focal_35mm * _OF_A_VIDEO * max(width, height) / _FULL_FRAME_DIAGONAL_MM
     how = (
         f"the video's metadata: as {focal_35mm:g} mm on 35 mm film, {focal_px:.1f} px if the whole width "
@@ -117,6 +118,12 @@ def intrinsics_of_video(path: Path, width: int, height: int) -> tuple[Camera, Ca
     )
     camera = centred_camera(width, height, focal_px)
     return camera, CameraSource(Certainty.NOMINAL, how, _VIDEO_SIGMA)
+
+
+def _named(path: Path, found: Intrinsics) -> tuple[Camera, CameraSource]:
+    if found.certainty is Certainty.GUESSED:
+        _log.warning("%s: the intrinsics are unknown; taken is %s", path.name, found.how)
+    return found.camera, CameraSource(found.certainty, found.how)
 
 
 def centred_camera(width: int, height: int, focal_px: float) -> Camera:

@@ -92,7 +92,7 @@ def settle_camera(
     guess = dataset.camera
     prior = prior_of(guess.fx, source, config)
     sigma = prior.sigma_log_f
-    logger.warning("intrinsics are not given: %s", source.how)
+    logger.info("intrinsics are not given: %s", source.how)
     if config.odometry != "orb" or getattr(dataset, "is_live", False):
         return OpeningCamera(source, None, sigma)
     passes: list[tuple[float, Sights]] = []
