@@ -54,10 +54,6 @@ def camera_of_another_size(sequence: Path) -> None:
     (sequence / "camera.yaml").write_text(text.replace("width: 320", "width: 640"))
 
 
-def camera_unknown(sequence: Path) -> None:
-    (sequence / "camera.yaml").unlink()
-
-
 def camera_malformed(sequence: Path) -> None:
     (sequence / "camera.yaml").write_text("width: 320\n")
 
@@ -83,7 +79,6 @@ BAD_SEQUENCES: list[tuple[Callable[[Path], None], str]] = [
     (most_images_broken, "more than half of the images do not decode"),
     (one_image_of_another_size, "the image is 100x100, the camera says 320x240"),
     (camera_of_another_size, "the image is 320x240, the camera says 640x240"),
-    (camera_unknown, "intrinsics are unknown"),
     (camera_malformed, "camera.yaml: keys height, fx, fy, cx, cy missing"),
     (ground_truth_of_another_day, "groundtruth.txt: no pose within"),
     (ground_truth_malformed, "groundtruth.txt:2: expected eight numbers"),

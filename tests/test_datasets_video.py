@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from slamdepth.datasets import Dataset, open_dataset, write_camera
+from slamdepth.datasets.intrinsics import Certainty
 from slamdepth.datasets.readers.video import VideoSequence
 from slamdepth.datasets.video import VideoFile
 from slamdepth.errors import CameraError, DatasetError
@@ -84,11 +85,10 @@ def test_large_frames_are_reduced_with_their_camera(
     assert dataset.notes == [f"frames of {width}x{height} are reduced to {reduced[0]}x{reduced[1]} pixels"]
 
 
-def test_a_video_needs_its_camera(tmp_path: Path) -> None:
+def test_a_video_has_its_own_camera_alone(tmp_path: Path) -> None:
     video = grey_video(tmp_path / "walk.mp4")
     camera_file(tmp_path / "camera.yaml")  # of whatever else lies there
-    with pytest.raises(CameraError, match=r"walk.mp4: the intrinsics of a video are unknown.*'width: 64'"):
-        open_dataset(video)
+    assert open_dataset(video).camera_source.certainty is Certainty.GUESSED
     with pytest.raises(CameraError, match="the image is 64x48, the camera says 128x96"):
         open_dataset(video, camera_file(tmp_path / "other.yaml", 128, 96))
 

@@ -24,6 +24,13 @@ def test_a_steady_path_is_good_and_says_so_in_one_line() -> None:
     assert health.spans == ()
 
 
+def test_a_guessed_camera_that_the_motion_does_not_show_is_a_doubt() -> None:
+    health = judge_run(replace(facts(), camera_is_guessed=True))
+    assert health.verdict is Verdict.DOUBTFUL
+    assert health.headline == "Check this result: the focal length is a guess."
+    assert "Give --fov or --camera" in health.reasons[0]
+
+
 def test_a_verdict_can_be_written_as_json() -> None:
     lost = states(COUNT, (60, 160, TrackingStatus.LOST))
     written = json.loads(json.dumps(judge_run(facts(states=lost)).to_dict()))

@@ -30,6 +30,17 @@ CameraOption = Annotated[
     Path | None,
     typer.Option("--camera", metavar="FILE", help="camera.yaml with the intrinsics in pixels."),
 ]
+FovOption = Annotated[
+    float | None,
+    typer.Option(
+        "--fov",
+        min=1.0,
+        max=170.0,
+        metavar="DEG",
+        help="Field of view across the longer side of an image, instead of --camera; the focal length is "
+        "looked for about it.",
+    ),
+]
 StrideOption = Annotated[int, typer.Option("--stride", min=1, metavar="N", help="Take every Nth frame.")]
 MaxFramesOption = Annotated[
     int | None, typer.Option("--max-frames", min=1, metavar="N", help="Take no more than N frames.")

@@ -14,6 +14,7 @@ from slamdepth.cli.options import (
     DepthTopicOption,
     DepthWeightsOption,
     FollowLinksOption,
+    FovOption,
     MaxFramesOption,
     PortOption,
     PoseTopicOption,
@@ -126,6 +127,7 @@ def run_command(
         ),
     ] = False,
     camera: CameraOption = None,
+    fov: FovOption = None,
     readout_ms: Annotated[
         float | None,
         typer.Option(
@@ -261,6 +263,7 @@ def run_command(
             sequence,
             output,
             camera=camera,
+            view_deg=fov,
             config=settings,
             max_frames=max_frames,
             stride=stride,

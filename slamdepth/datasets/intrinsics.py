@@ -3,19 +3,32 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
 from slamdepth.calibration import CAMERA_FILE
+from slamdepth.datasets.quicktime import video_focal_35mm
+from slamdepth.errors import CameraError
 from slamdepth.types import Camera
+
+_log = logging.getLogger(__name__)
 
 GUESSED_VIEW_DEG = 60.0
 """Field of view across the longer side where nothing is known: between a phone's main camera
 (65 to 70 degrees) and a depth camera's (57)."""
 
+NOMINAL_SIGMA = 0.05
+"""Relative deviation of a focal length that a photograph or a user names: rounded to whole millimetres or
+degrees, and of the lens rather than of the image."""
+
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
+_OF_A_VIDEO = math.hypot(1.0, 0.75)
+"""Diagonal over longer side of the 4:3 sensor that a video is cut out of, over its whole width."""
+_VIDEO_SIGMA = 0.1
+"""Stabilisation cuts up to a fifth off a video's width, and the file does not say how much."""
 _EXIF_IFD, _FOCAL_LENGTH_35MM = 0x8769, 0xA405
 
 
@@ -35,10 +48,12 @@ class CameraSource:
         certainty: GIVEN by a file or a known data set, NOMINAL from what the recording says of its lens, or
             GUESSED.
         how: the same as a user should read it, such as "camera.yaml next to the images".
+        sigma_log_f: deviation of the logarithm of a NOMINAL focal length.
     """
 
     certainty: Certainty
     how: str
+    sigma_log_f: float = NOMINAL_SIGMA
 
 
 @dataclass(frozen=True)
@@ -77,14 +92,56 @@ def intrinsics_of(width: int, height: int, focal_35mm: float | None = None) -> I
         focal_35mm: the focal length in millimetres a lens with the same view would have on a
             36 x 24 mm film, by the diagonal (CIPA DCG-001), from the image's EXIF.
     """
-    centre = ((width - 1) / 2, (height - 1) / 2)
     if focal_35mm is not None:
         focal_px = focal_35mm * math.hypot(width, height) / _FULL_FRAME_DIAGONAL_MM
         how = f"EXIF: as {focal_35mm:g} mm on 35 mm film, {focal_px:.1f} px; wrong if the image was cropped"
-        return Intrinsics(Camera(width, height, focal_px, focal_px, *centre), how, Certainty.NOMINAL)
-    focal_px = max(width, height) / (2.0 * math.tan(math.radians(GUESSED_VIEW_DEG) / 2.0))
-    how = f"a guess: {GUESSED_VIEW_DEG:g} degrees across the longer side, so {focal_px:.1f} px"
-    return Intrinsics(Camera(width, height, focal_px, focal_px, *centre), how, Certainty.GUESSED)
+        return Intrinsics(centred_camera(width, height, focal_px), how, Certainty.NOMINAL)
+    camera = camera_of_view(width, height, GUESSED_VIEW_DEG)
+    how = f"a guess: {GUESSED_VIEW_DEG:g} degrees across the longer side, so {camera.fx:.1f} px"
+    return Intrinsics(camera, how, Certainty.GUESSED)
+
+
+def intrinsics_of_images(path: Path, width: int, height: int) -> tuple[Camera, CameraSource]:
+    """The camera of images like ``path``, of this upright size, without a camera file: by EXIF or a guess."""
+    return _named(path, intrinsics_of(width, height, exif_focal_35mm(path)))
+
+
+def intrinsics_of_video(path: Path, width: int, height: int) -> tuple[Camera, CameraSource]:
+    """The camera of a video of this upright size without a camera file: by its metadata or a guess."""
+    focal_35mm = video_focal_35mm(path)
+    if focal_35mm is None:
+        return _named(path, intrinsics_of(width, height))
+    focal_px = focal_35mm * _OF_A_VIDEO * max(width, height) / _FULL_FRAME_DIAGONAL_MM
+    how = (
+        f"the video's metadata: as {focal_35mm:g} mm on 35 mm film, {focal_px:.1f} px if the whole width "
+        "of the sensor was used"
+    )
+    camera = centred_camera(width, height, focal_px)
+    return camera, CameraSource(Certainty.NOMINAL, how, _VIDEO_SIGMA)
+
+
+def _named(path: Path, found: Intrinsics) -> tuple[Camera, CameraSource]:
+    if found.certainty is Certainty.GUESSED:
+        _log.warning("%s: the intrinsics are unknown; taken is %s", path.name, found.how)
+    return found.camera, CameraSource(found.certainty, found.how)
+
+
+def centred_camera(width: int, height: int, focal_px: float) -> Camera:
+    """A camera without distortion whose centre is the middle of the image."""
+    return Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+
+
+def camera_of_view(width: int, height: int, view_deg: float) -> Camera:
+    """A camera that sees ``view_deg`` degrees across the longer side of its image.
+
+    Raises:
+        CameraError: no image of a pinhole camera has such a view.
+    """
+    if not 1.0 <= view_deg <= 170.0:
+        raise CameraError(
+            f"a field of view of {view_deg:g} degrees: possible are from 1 to 170, across the longer side"
+        )
+    return centred_camera(width, height, max(width, height) / (2.0 * math.tan(math.radians(view_deg) / 2.0)))
 
 
 def exif_focal_35mm(path: Path) -> float | None:

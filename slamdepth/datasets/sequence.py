@@ -12,6 +12,7 @@ import numpy as np
 
 from slamdepth.datasets.association import associate
 from slamdepth.datasets.base import Dataset
+from slamdepth.datasets.intrinsics import CameraSource
 from slamdepth.datasets.orientation import UPRIGHT, check_size, turned_image
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import read_depth_m, read_image_rgb
@@ -50,6 +51,7 @@ class ImageSequence(Dataset):
     unknown_raw_depth: tuple[int, ...] = ()
     why_no_depth: str = ""
     orientation: int = UPRIGHT
+    camera_source: CameraSource = Dataset.camera_source
     has_depth: bool = field(init=False)
 
     def __post_init__(self) -> None:

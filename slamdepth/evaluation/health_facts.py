@@ -41,6 +41,7 @@ class RunFacts:
         least_inliers: with fewer inliers the tracker takes a frame for lost.
         others: the maps that never met this one, the largest first.
         scale_is_known: False where nothing is known of the size of the path.
+        camera_is_guessed: True where the focal length was guessed and the motion does not show it.
         first_s: time that spans are counted from; None: that of the first frame.
     """
 
@@ -52,6 +53,7 @@ class RunFacts:
     least_inliers: int = 20
     others: Sequence[MapFacts] = ()
     scale_is_known: bool = True
+    camera_is_guessed: bool = False
     first_s: float | None = None
 
     @property

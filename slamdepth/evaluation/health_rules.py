@@ -302,6 +302,23 @@ def _scale(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan])
     )
 
 
+def _guessed_camera(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
+    """A wrong focal length bends the path and stretches the map along the view.
+
+    It does so however well everything was tracked, and no other figure shows it. Motion that tells nothing
+    of the focal length looks the same with any.
+    """
+    if not facts.camera_is_guessed:
+        return None
+    return Finding(
+        Verdict.DOUBTFUL,
+        "the focal length is a guess",
+        "The focal length was guessed, and the motion does not show it: the path may be bent. Give --fov or "
+        "--camera.",
+        is_local=False,
+    )
+
+
 def _sparse_footage(facts: RunFacts, numbers: HealthNumbers, spans: Sequence[HealthSpan]) -> Finding | None:
     """Says what could not be judged; that is no evidence against the result."""
     if leaps_are_judged(numbers):
@@ -327,6 +344,7 @@ RULES: tuple[Rule, ...] = (
     _keyframe_rate,
     _refused_loops,
     _scale,
+    _guessed_camera,
     _sparse_footage,
 )
 

@@ -31,6 +31,7 @@ class RunOptions:
         sequence: a video or the folder of a sequence.
         output: run folder; None makes ``runs/<sequence>-<time>``.
         camera_file: a ``camera.yaml`` that overrules what the sequence says.
+        view_deg: field of view across the longer side of an image, which overrules it too.
         max_frames: stop after this many frames; None reads all.
         stride: take every Nth frame.
         mesh: fuse the keyframes and write ``mesh.ply`` and ``cloud.ply``.
@@ -42,7 +43,7 @@ class RunOptions:
         exports: formats that the result is exported to, see :func:`slamdepth.export_run`.
 
     Raises:
-        ConfigError: ``stride`` or ``max_frames`` is below 1.
+        ConfigError: ``stride`` or ``max_frames`` is below 1, or both a camera file and a view are given.
     """
 
     sequence: Path
@@ -57,11 +58,14 @@ class RunOptions:
     checkpoint_s: float = CHECKPOINT_S
     reading: ReadOptions = field(default_factory=ReadOptions)
     exports: tuple[str, ...] = ()
+    view_deg: float | None = None
 
     def __post_init__(self) -> None:
         check_frames_asked(self.stride, self.max_frames)
         if not 0.0 <= self.checkpoint_s < math.inf:
             raise ConfigError(f"checkpoints must be 0 or more seconds apart, got {self.checkpoint_s:g}")
+        if self.camera_file is not None and self.view_deg is not None:
+            raise ConfigError("a camera file and a field of view exclude each other")
 
     def indices_of(self, dataset: Dataset) -> range:
         """Which frames of ``dataset`` are read, in order; of a live source, all that there may ever be."""
@@ -94,6 +98,7 @@ def check_frames_asked(stride: int, max_frames: int | None) -> None:
 class RunStage(str, Enum):
     """What a run is doing."""
 
+    CALIBRATING = "finding the focal length"
     SCALING = "fitting the scale"
     TRACKING = "tracking"
     OPTIMISING = "optimising"

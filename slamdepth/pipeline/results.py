@@ -129,6 +129,7 @@ def judge_health(
     scale: ScaleFacts,
     *,
     is_measured: bool,
+    camera_is_guessed: bool = False,
 ) -> Health:
     """Whether the result can be trusted, by what the run knows of itself.
 
@@ -137,6 +138,7 @@ def judge_health(
         steps: one for each frame, in order.
         scale: of the largest map.
         is_measured: a sensor measured the depth.
+        camera_is_guessed: the focal length was guessed, and the motion does not show it.
     """
     health = judge_run(
         RunFacts(
@@ -148,6 +150,7 @@ def judge_health(
             config.tracking.min_inliers,
             tuple(MapFacts(one.trajectory, one.points_m, one.statistics) for one in reconstruction.others),
             scale_is_known=not scale.is_unknown,
+            camera_is_guessed=camera_is_guessed,
         )
     )
     logger.info("verdict: %s. %s", health.verdict.value, health.headline)

@@ -28,6 +28,7 @@ from slamdepth.io import write_text
 from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapstore import Map, Session
 from slamdepth.pipeline import checkpoint
+from slamdepth.pipeline.camera import OpeningCamera, check_camera, settle_camera, use_view
 from slamdepth.pipeline.checkpoint import Checkpoints, Latest, SequenceKeyframes, begin
 from slamdepth.pipeline.dense import measure_depth
 from slamdepth.pipeline.export import check_exports, export_results
@@ -75,6 +76,7 @@ def run(
     *,
     depth: str | None = None,
     camera: str | Path | None = None,
+    view_deg: float | None = None,
     config: Config | str | Path | None = None,
     max_frames: int | None = None,
     stride: int = 1,
@@ -100,7 +102,10 @@ def run(
         output: run folder. Default: ``runs/<sequence>-<time>``.
         depth: name of the depth model, see :func:`slamdepth.create_depth_model`; ``"sensor"`` takes the
             sequence's own depth. Default: as ``config`` says, which is ``"auto"`` unless changed.
-        camera: a ``camera.yaml`` with the intrinsics. Default: as the sequence says.
+        camera: a ``camera.yaml`` with the intrinsics. Default: as the sequence says; where it does not,
+            they are found from the motion.
+        view_deg: field of view in degrees across the longer side of an image, about which the focal length
+            is looked for; instead of ``camera``.
         config: every other setting, or a YAML file with settings. Default: ``Config()``.
         max_frames: stop after this many frames. Default: all.
         stride: take every Nth frame.
@@ -138,6 +143,7 @@ def run(
         CHECKPOINT_S if checkpoint_s is None else checkpoint_s,
         reading or ReadOptions(),
         tuple(export),
+        view_deg,
     )
     return run_job(options, _settings(config, depth), progress, stop, watcher=watcher)
 
@@ -186,15 +192,19 @@ class _Job:
 
     Attributes:
         indices: which frames of the dataset are tracked.
+        about: what tells the sequence from others, see :func:`describe`; None of a live source.
         latest: the checkpoint that the run goes on from.
+        camera: how the camera was found.
         model: the depth model as the tracker gets it, scaled where that was asked for.
     """
 
     options: RunOptions
     config: Config
     dataset: Dataset
+    about: dict[str, Any] | None
     indices: range
     folder: RunFolder
+    camera: OpeningCamera
     model: DepthModel
     scale: PredictionScale
     tracker: AnyTracker
@@ -229,11 +239,14 @@ def _prepare(
     config = with_chosen_model(config)
     start_map = None if options.start_map is None else Map.load(options.start_map)
     dataset = open_dataset(options.sequence, options.camera_file, options.reading)
+    if options.view_deg is not None:
+        use_view(dataset, options.view_deg)
     indices = options.indices_of(dataset)
     if dataset.imu_path is not None and config.scale.imu is None:
         dataset.notes.append(f"inertial data is there, for scale and gravity: --imu {dataset.imu_path}")
+    about = None if dataset.is_live else describe(dataset)
     check_scale_options(dataset, config, indices)
-    if begun is not None and describe(dataset) != begun.sequence:
+    if begun is not None and about != begun.sequence:
         raise DatasetError(
             f"{dataset.path}: is not the sequence that the run was tracking; name that one, or start the run "
             "again with --overwrite"
@@ -248,6 +261,9 @@ def _prepare(
                 f"{dataset.path}: {lack_of_depth(dataset)}; run it with predicted depth: --depth dinov2"
             )
         dataset.notes += check_sensor_depth(dataset, indices)
+    camera = settle_camera(dataset, indices, given, config, tell, stop)
+    if camera.prior is not None:
+        seed_everything(config.seed)
     scale = choose_prediction_scale(
         dataset,
         given,
@@ -263,7 +279,9 @@ def _prepare(
     if latest is not None and isinstance(tracker, Tracker):
         stored = SequenceKeyframes(dataset, folder.path, latest, with_depth=is_sensor(model))
         tracker.restore(latest.tracker, stored.read_frame, stored.read_prediction)
-    return _Job(options, config, dataset, indices, folder, model, scale, tracker, start_map, latest)
+    return _Job(
+        options, config, dataset, about, indices, folder, camera, model, scale, tracker, start_map, latest
+    )
 
 
 def describe(dataset: Dataset) -> dict[str, Any]:
@@ -286,8 +304,8 @@ def _track(
     latest = job.latest
     if latest is None:
         folder.create(_arguments(job.options))
-        if not dataset.is_live:
-            begin(folder.path, begun_run(job.options, config, dataset))
+        if job.about is not None:
+            begin(folder.path, begun_run(job.options, config, job.about))
     # what a live source gave cannot be read again
     checkpoints = Checkpoints(folder.path, 0.0 if dataset.is_live else job.options.checkpoint_s)
     try:
@@ -329,7 +347,7 @@ def _track(
         checkpoints.close()
 
 
-def begun_run(options: RunOptions, config: Config, dataset: Dataset) -> dict[str, Any]:
+def begun_run(options: RunOptions, config: Config, about: dict[str, Any]) -> dict[str, Any]:
     """What it takes to do a run again."""
     asked = asdict(options)
     paths = ("sequence", "camera_file", "start_map")
@@ -339,7 +357,7 @@ def begun_run(options: RunOptions, config: Config, dataset: Dataset) -> dict[str
             **{name: None if asked[name] is None else str(Path(asked[name]).absolute()) for name in paths},
         },
         "config": config.model_dump(mode="json"),
-        "sequence": describe(dataset),
+        "sequence": about,
     }
 
 
@@ -349,6 +367,7 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
     reconstruction, scale_facts, scale_notes = settle_scale(
         dataset, tracked.reconstruction, scale, config, tell
     )
+    camera = check_camera(dataset, job.camera, job.tracker)
     others, other_notes = settle_others(dataset, tracked.reconstruction, scale, config)
     reconstruction = replace(reconstruction, others=tuple(one.reconstruction for one in others))
     maps = (reconstruction, *reconstruction.others)
@@ -436,7 +455,15 @@ def _finish(job: _Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
             fps=tracked.fps,
             config=config,
             scale=scale_facts,
-            health=judge_health(reconstruction, tracked.steps, config, scale_facts, is_measured=is_measured),
+            health=judge_health(
+                reconstruction,
+                tracked.steps,
+                config,
+                scale_facts,
+                is_measured=is_measured,
+                camera_is_guessed=camera.is_a_guess,
+            ),
+            camera=camera,
             weights=(*job.model.weights, *feature_weights(config.features)),
             steps=tracked.steps,
             trajectory_score=trajectory_score,
@@ -493,6 +520,8 @@ def _arguments(options: RunOptions) -> list[str]:
     arguments = [without_secret(str(options.sequence))]
     if options.camera_file is not None:
         arguments += ["--camera", str(options.camera_file)]
+    if options.view_deg is not None:
+        arguments += ["--fov", f"{options.view_deg:g}"]
     if options.max_frames is not None:
         arguments += ["--max-frames", str(options.max_frames)]
     if options.stride != 1:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from slamdepth.report.camera import CameraFacts
 from slamdepth.report.console import run_table, scale_table, surface_table, trajectory_table
 from slamdepth.report.data import MapData, MeshCounts, ReportData
 from slamdepth.report.html import build_html
@@ -12,6 +13,7 @@ from slamdepth.report.summary import build_summary
 from slamdepth.report.write import write_report
 
 __all__ = [
+    "CameraFacts",
     "MapData",
     "MeshCounts",
     "MeshImage",

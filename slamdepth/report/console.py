@@ -36,6 +36,7 @@ def run_table(summary: dict[str, Any]) -> Table:
         ("loop closures", count(summary["loop_closures"])),
         ("relocalisations", count(summary["relocalisations"])),
         ("scale", summary["scale"]["sentence"]),
+        *_camera_rows(summary["camera"]),
         ("rolling shutter", summary["rolling_shutter"]["sentence"]),
     ]
     is_scored = summary["ate"]["se3"]["rmse_m"] is not None
@@ -59,6 +60,10 @@ def _health_rows(health: dict[str, Any]) -> Rows:
     """The verdict in one line; where it is not good, the reasons too."""
     reasons = [] if health["verdict"] == Verdict.GOOD.value else health["reasons"]
     return [("verdict", health["headline"]), *(("", reason) for reason in reasons)]
+
+
+def _camera_rows(camera: dict[str, Any] | None) -> Rows:
+    return [] if camera is None else [("camera", camera["sentence"])]
 
 
 def _frame_rows(summary: dict[str, Any]) -> Rows:

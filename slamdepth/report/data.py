@@ -9,6 +9,7 @@ from slamdepth.config import Config
 from slamdepth.evaluation import AlignedScores, DepthScore, Health, TrajectoryScore
 from slamdepth.mapping.mesh import Mesh
 from slamdepth.mapping.reconstruction import Reconstruction
+from slamdepth.report.camera import CameraFacts
 from slamdepth.report.mesh_images import MeshImage
 from slamdepth.report.scale import ScaleFacts
 from slamdepth.report.scene.model import Scene
@@ -57,6 +58,7 @@ class ReportData:
         config: every setting of the run.
         scale: is the largest map metric, and how was its scale found.
         health: can the result be trusted, where not, and why.
+        camera: the camera, and how it is known; None where that is not said.
         weights: every weights file that took part, and the data each has seen.
         steps: one result for each frame, in order; empty where they were not kept.
         trajectory_score, depth_score, mesh: of the largest map; None where there is none.
@@ -80,6 +82,7 @@ class ReportData:
     config: Config
     scale: ScaleFacts
     health: Health
+    camera: CameraFacts | None = None
     weights: tuple[WeightsInfo, ...] = ()
     steps: tuple[StepResult, ...] = ()
     trajectory_score: TrajectoryScore | None = None

@@ -28,6 +28,7 @@ def build_summary(data: ReportData) -> dict[str, Any]:
         "depth_model": data.depth_model,
         "depth_is_measured": data.depth_is_measured,
         "features": data.config.features.name if data.config.odometry == "orb" else None,
+        "camera": None if data.camera is None else data.camera.to_dict(),
         "scale": data.scale.to_dict(),
         "frames": statistics.frames,
         "tracked": statistics.tracked,

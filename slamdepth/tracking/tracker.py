@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from slamdepth.backend.sights import Sights
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.metric import metric_model
@@ -30,6 +31,7 @@ from slamdepth.tracking.frame_log import check_frame
 from slamdepth.tracking.map_parts import RunParts, StoredKeyframes
 from slamdepth.tracking.map_tracker import MapTracker, Placed
 from slamdepth.tracking.saved_maps import MapInfo, load_map, save_map
+from slamdepth.tracking.self_calibration import sights_of
 from slamdepth.tracking.snapshot import MapSnapshot, snapshot_of
 from slamdepth.tracking.status import STATUS
 from slamdepth.tracking.wide_features import WideFeatures
@@ -312,6 +314,24 @@ class Tracker:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def sights_seen(tracker: object) -> Sights | None:
+    """What the maps of a tracker see, to find the camera by (:mod:`slamdepth.backend.self_calibration`).
+
+    Args:
+        tracker: no frame may follow.
+
+    Returns:
+        None where that is too little, or the tracker has no landmarks.
+    """
+    if not isinstance(tracker, Tracker):
+        return None
+    if not tracker._finished:
+        tracker._workers.between.wait()
+        with single_threaded():
+            tracker._active.integration.run_all()
+    return sights_of(tracker._atlas.maps, tracker.camera)
 
 
 def _load_libraries() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of images as a sequence, taken at equal intervals by a camera that has to be given."""
+"""A folder of images as a sequence, taken at equal intervals."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slamdepth.calibration import CAMERA_FILE, what_to_write
+from slamdepth.calibration import CAMERA_FILE
 from slamdepth.datasets.image_files import has_images, list_images
+from slamdepth.datasets.intrinsics import CameraSource, Certainty, intrinsics_of_images
 from slamdepth.datasets.orientation import check_size, exif_orientation, fitted_camera
 from slamdepth.datasets.registry import register_last_reader
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
 from slamdepth.datasets.sequence import ImageSequence, first_image
-from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
+from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import read_depth_file, read_image_rgb
 from slamdepth.types import Camera, Frame
 
@@ -30,7 +31,7 @@ class ImagesReader:
     """Opens folders of images without another layout."""
 
     name = "images"
-    needs = "a folder of images, in the order of their names; camera.yaml in it, or --camera"
+    needs = "a folder of images, in the order of their names; optional camera.yaml in it"
 
     def matches(self, path: Path) -> bool:
         return has_images(path) and not (path / PAIRS_FILE).exists()
@@ -44,17 +45,17 @@ class ImagesReader:
         _check_names(path, images)
         sample_path, sample_shape = first_image(images)
         _check_no_depth(sample_path)
+        source = CameraSource(Certainty.GIVEN, "--camera")
         camera_path = path / CAMERA_FILE
         if camera is None and camera_path.exists():
             camera = Camera.from_file(camera_path, notes)
-        if camera is None:
-            raise CameraError(
-                f"{path}: the intrinsics of these images are unknown: write {camera_path} or pass --camera "
-                f"FILE with {what_to_write(sample_shape[1], sample_shape[0])}"
-            )
+            source = CameraSource(Certainty.GIVEN, CAMERA_FILE)
         orientation = exif_orientation(sample_path, notes)
-        camera = fitted_camera(sample_path, sample_shape, camera, orientation, notes)
-        return FolderSequence(path, camera, images, notes)
+        if camera is None:
+            camera, source = intrinsics_of_images(sample_path, sample_shape[1], sample_shape[0])
+        else:
+            camera = fitted_camera(sample_path, sample_shape, camera, orientation, notes)
+        return FolderSequence(path, camera, images, notes, source)
 
 
 class FolderSequence(ImageSequence):
@@ -63,9 +64,17 @@ class FolderSequence(ImageSequence):
     Args:
         taken_by: the camera of the upright images in their own size; its ``fps`` gives the times.
         notes: takes a line for each assumption.
+        source: where the camera comes from.
     """
 
-    def __init__(self, path: Path, taken_by: Camera, images: tuple[Path, ...], notes: list[str]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        taken_by: Camera,
+        images: tuple[Path, ...],
+        notes: list[str],
+        source: CameraSource = ImageSequence.camera_source,
+    ) -> None:
         notes.append(
             f"times are counted: {len(images)} images in the order of their names, {images[0].name} to "
             f"{images[-1].name}, {taken_by.fps:g} a second (fps of the camera file, 30 where it says none)"
@@ -73,8 +82,10 @@ class FolderSequence(ImageSequence):
         times_s: NDArray[np.float64] = np.arange(len(images)) / taken_by.fps
         camera = reduced_camera(taken_by, notes)
         without = (None,) * len(images)
-        super().__init__(path.resolve().name, path, camera, times_s, images, without, None, notes)
-        self._taken_by = taken_by
+        super().__init__(
+            path.resolve().name, path, camera, times_s, images, without, None, notes, camera_source=source
+        )
+        self._original_size = taken_by.width, taken_by.height
 
     def read(self, index: int, *, with_depth: bool = False) -> Frame:
         """Read one frame; see :meth:`slamdepth.datasets.base.Dataset.read`.
@@ -93,8 +104,9 @@ class FolderSequence(ImageSequence):
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         image_rgb = read_image_rgb(self.image_paths[index])
-        check_size(self.image_paths[index], image_rgb.shape, self._taken_by)
-        return Frame(index, float(self.timestamps_s[index]), image_rgb, self._taken_by)
+        taken_by = self.camera.scaled(*self._original_size)
+        check_size(self.image_paths[index], image_rgb.shape, taken_by)
+        return Frame(index, float(self.timestamps_s[index]), image_rgb, taken_by)
 
 
 def _check_names(path: Path, images: tuple[Path, ...]) -> None:

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from slamdepth.calibration import CAMERA_FILE, what_to_write
+from slamdepth.calibration import CAMERA_FILE
 from slamdepth.datasets.association import associate
 from slamdepth.datasets.image_files import has_images
+from slamdepth.datasets.intrinsics import CameraSource, Certainty, intrinsics_of_images
 from slamdepth.datasets.orientation import exif_orientation, fitted_camera
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import (
@@ -25,7 +26,7 @@ from slamdepth.datasets.sequence import (
     first_image,
     is_file,
 )
-from slamdepth.errors import CameraError, DatasetError
+from slamdepth.errors import DatasetError
 from slamdepth.io import parse_float, read_tum_trajectory
 from slamdepth.io.columns import stated_unit
 from slamdepth.io.text import read_commented_lines
@@ -72,10 +73,14 @@ class TumReader:
         times, image_paths = read_image_list(path / "rgb.txt")
         _check_images(path / "rgb.txt", image_paths, notes)
         sample_path, sample_shape = first_image(image_paths)
+        source = CameraSource(Certainty.GIVEN, "--camera")
         if camera is None:
-            camera = _find_camera(path, sample_shape, notes)
+            camera, source = _find_camera(path, notes)
         orientation = exif_orientation(sample_path, notes)
-        camera = fitted_camera(sample_path, sample_shape, camera, orientation, notes)
+        if camera is None:
+            camera, source = intrinsics_of_images(sample_path, sample_shape[1], sample_shape[0])
+        else:
+            camera = fitted_camera(sample_path, sample_shape, camera, orientation, notes)
         timestamps_s = _seconds(path / "rgb.txt", times, camera.fps, None, notes)
 
         depth_paths, why_no_depth = _match_depth(path / "depth.txt", timestamps_s, camera.fps, notes)
@@ -95,6 +100,7 @@ class TumReader:
             notes,
             why_no_depth=why_no_depth,
             orientation=orientation,
+            camera_source=source,
         )
 
 
@@ -196,10 +202,11 @@ def _range(times_s: Floats) -> str:
     return f"{times_s[0]:.3f} to {times_s[-1]:.3f} s"
 
 
-def _find_camera(path: Path, image_shape: tuple[int, ...], notes: list[str]) -> Camera:
+def _find_camera(path: Path, notes: list[str]) -> tuple[Camera | None, CameraSource]:
+    """The camera by a file in the folder, or by the folder's name; None where there is neither."""
     camera_path = path / CAMERA_FILE
     if camera_path.exists():
-        return Camera.from_file(camera_path, notes)
+        return Camera.from_file(camera_path, notes), CameraSource(Certainty.GIVEN, CAMERA_FILE)
     for name in (path.name, path.resolve().name):  # the second for '.' and links
         camera = known_camera(name)
         if camera is not None:
@@ -207,9 +214,5 @@ def _find_camera(path: Path, image_shape: tuple[int, ...], notes: list[str]) -> 
             if camera is _KNOWN_CAMERAS["2"]:
                 note += "; depth factor 5000 as the benchmark says, ORB-SLAM2 uses 5208 for freiburg2"
             notes.append(note)
-            return camera
-    height, width = image_shape[:2]
-    raise CameraError(
-        f"{path}: intrinsics are unknown: write {camera_path} or pass --camera FILE with "
-        f"{what_to_write(width, height)}"
-    )
+            return camera, CameraSource(Certainty.GIVEN, "the TUM benchmark, by the folder's name")
+    return None, CameraSource(Certainty.GUESSED, "")

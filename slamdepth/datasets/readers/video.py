@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A video file as a sequence without depth and ground truth; its camera has to be given."""
+"""A video file as a sequence without depth and ground truth."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slamdepth.calibration import what_to_write
 from slamdepth.datasets.base import Dataset
+from slamdepth.datasets.intrinsics import CameraSource, Certainty, intrinsics_of_video
 from slamdepth.datasets.orientation import fitted_camera
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
-from slamdepth.errors import CameraError, ImageDecodeError
+from slamdepth.errors import ImageDecodeError
 from slamdepth.types import Camera, Frame, Trajectory
 
 if TYPE_CHECKING:
@@ -31,23 +31,21 @@ class VideoReader:
     """Opens video files."""
 
     name = "video"
-    needs = f"a file {', '.join(VIDEO_ENDINGS)}; its camera by --camera"
+    needs = f"a file {', '.join(VIDEO_ENDINGS)}"
 
     def matches(self, path: Path) -> bool:
         return path.is_file() and path.suffix.lower() in VIDEO_ENDINGS
 
     def open(self, path: Path, camera: Camera | None) -> VideoSequence:
         video = VideoFile(path)
-        if camera is None:
-            # a camera.yaml next to a video may belong to another one
-            raise CameraError(
-                f"{path}: the intrinsics of a video are unknown: pass --camera FILE, a camera.yaml with "
-                f"{what_to_write(video.width, video.height)}"
-            )
         notes: list[str] = []
-        size = (video.height, video.width)
-        camera = fitted_camera(path, size, camera, video.orientation, notes)
-        return VideoSequence(video, camera, notes)
+        if camera is None:  # a camera.yaml next to a video may belong to another one
+            camera, source = intrinsics_of_video(path, video.width, video.height)
+        else:
+            source = CameraSource(Certainty.GIVEN, "--camera")
+            size = (video.height, video.width)
+            camera = fitted_camera(path, size, camera, video.orientation, notes)
+        return VideoSequence(video, camera, notes, source)
 
 
 class VideoSequence(Dataset):
@@ -63,12 +61,19 @@ class VideoSequence(Dataset):
     Args:
         camera: for upright images of the video's own size.
         notes: what is known of both already.
+        source: where the camera comes from.
     """
 
     has_depth = False
     ground_truth: Trajectory | None = None
 
-    def __init__(self, video: VideoFile, camera: Camera, notes: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        video: VideoFile,
+        camera: Camera,
+        notes: Sequence[str] = (),
+        source: CameraSource = Dataset.camera_source,
+    ) -> None:
         self.name, self.path = video.path.stem, video.path
         # A camera file without fps has the default, which says less than the video.
         camera_fps = camera.fps if camera.fps != DEFAULT_FPS else None
@@ -78,7 +83,8 @@ class VideoSequence(Dataset):
         self.frames_promised = video.frames_named if missing else len(self)
         self.notes += [missing] if missing else []
         self.camera = replace(reduced_camera(camera, self.notes), fps=video.fps)
-        self._taken_by = replace(camera, fps=video.fps)
+        self._original_size = camera.width, camera.height
+        self.camera_source = source
         self._video = video
         self._lock = threading.Lock()
         self._frames = video.frames()
@@ -100,8 +106,9 @@ class VideoSequence(Dataset):
 
     def read_original(self, index: int) -> Frame:
         """Read one frame in the video's own size; raises as :meth:`read`."""
-        image_rgb = self._read(index, self._taken_by)
-        return Frame(index, float(self.timestamps_s[index]), image_rgb, self._taken_by)
+        taken_by = self.camera.scaled(*self._original_size)
+        image_rgb = self._read(index, taken_by)
+        return Frame(index, float(self.timestamps_s[index]), image_rgb, taken_by)
 
     def _read(self, index: int, camera: Camera) -> NDArray[np.uint8]:
         """The image ``(H, W, 3)`` of a frame in the size of ``camera``."""

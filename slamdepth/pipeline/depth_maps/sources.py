@@ -238,7 +238,9 @@ class _SequenceSource:
         self.fps: float | None = dataset.camera.fps / chosen.step
         self._indices = range(len(dataset))[chosen]
         self._dataset = dataset
-        self._intrinsics = Intrinsics(dataset.camera, "the sequence's own camera", Certainty.GIVEN)
+        source = dataset.camera_source
+        how = "the sequence's own camera" if source.certainty is Certainty.GIVEN else source.how
+        self._intrinsics = Intrinsics(dataset.camera, how, source.certainty)
 
     def __len__(self) -> int:
         return len(self._indices)
