@@ -77,6 +77,12 @@ class MadeUpTracker:
         status = TrackingStatus.LOST if is_lost else TrackingStatus.TRACKING
         return StepResult(frame.index, frame.timestamp_s, status, None if is_lost else pose(frame.index))
 
+    def ask_for_snapshot(self) -> None:
+        """It has no map."""
+
+    def take_snapshot(self) -> None:
+        return None
+
     def __enter__(self) -> MadeUpTracker:
         return self
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -133,7 +134,8 @@ def read(folder: Path, text: str, notes: list[str] | None = None) -> Camera:
 )
 def test_a_camera_of_another_system_is_read(tmp_path: Path, text: str, rest: dict[str, float]) -> None:
     notes: list[str] = []
-    assert read(tmp_path, text, notes) == Camera(752, 480, 458.5, 457.5, 367.25, 248.5, DISTORTION, **rest)
+    expected = Camera(752, 480, 458.5, 457.5, 367.25, 248.5, DISTORTION)
+    assert read(tmp_path, text, notes) == replace(expected, **rest)  # type: ignore[arg-type]
     assert notes[0].startswith("own.yaml: another tool's calibration, read as 752x480, fx 458.5")
 
 
