@@ -367,6 +367,16 @@ def test_every_cut_of_a_png_is_found() -> None:
     assert all(is_cut_short(data[:length]) for length in range(8, len(data)))
 
 
+def test_a_png_whose_chunk_claims_gigabytes_is_not_decoded(tmp_path: Path) -> None:
+    """OpenCV would reserve and clear them first."""
+    data = bytearray(cv2.imencode(".png", np.zeros((12, 16), np.uint8))[1].tobytes())
+    at = data.index(b"IDAT") - 4
+    data[at : at + 4] = (0xA9000026).to_bytes(4, "big")
+    (tmp_path / "i.png").write_bytes(bytes(data))
+    with pytest.raises(ImageDecodeError, match="cut short"):
+        read_image_rgb(tmp_path / "i.png")
+
+
 def test_no_image_and_wrong_depth_are_errors(tmp_path: Path) -> None:
     (tmp_path / "i.png").write_text("not an image")
     with pytest.raises(ImageDecodeError, match="does not decode"):

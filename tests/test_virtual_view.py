@@ -159,7 +159,7 @@ def test_a_video_and_a_folder_of_a_wide_lens_are_views(tmp_path: Path, walk: tup
     folder = tmp_path / "images"
     folder.mkdir()
     for image in images[:5]:
-        (folder / image.name).symlink_to(image)
+        (folder / image.name).hardlink_to(image)
     camera_file = walk[0] / "camera.yaml"
     expected = open_dataset(walk[0])
     dataset = open_dataset(folder, camera_file)
