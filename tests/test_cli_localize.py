@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``slamdepth localize``, ``run --map`` and the map a run leaves."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from command_line import call, images, leave_out_plots, slamdepth
+
+from slamdepth import Map
+from slamdepth.io import read_tum_trajectory
+
+
+@pytest.fixture(scope="module")
+def run_folder(tiny_room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "room"
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out_plots(patch)
+        arguments = ("--depth", "sensor", "--no-mesh", "--max-frames", 30, "--map-images")
+        done = call("run", tiny_room, "--output", folder, *arguments)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def digest(folder: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
+
+
+def test_a_run_leaves_a_map(run_folder: Path) -> None:
+    saved = Map.load(run_folder)
+    assert saved.has_images
+    assert saved.is_measured
+    assert saved.sessions[0].frames == 30
+    assert saved.scale["source"] == "sensor"
+    estimate, _ = read_tum_trajectory(run_folder / "trajectory.txt")
+    assert saved.trajectory().T_world_camera == pytest.approx(estimate.T_world_camera, abs=1e-6)
+    assert "map/" in (run_folder / "README.txt").read_text()
+
+
+def test_a_sequence_is_placed_in_the_map(run_folder: Path, tiny_room: Path, tmp_path: Path) -> None:
+    before = digest(run_folder / "map")
+    out = tmp_path / "found"
+    done = slamdepth("localize", "--map", run_folder, tiny_room, "--output", out)
+    assert done.returncode == 0, done.stderr
+    assert "placed" in done.stdout
+    trajectory, _ = read_tum_trajectory(out / "trajectory.txt")
+    with (out / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    figures = json.loads((out / "localized.json").read_text())
+    assert len(rows) == figures["frames"] == 40
+    assert len(trajectory) == figures["placed"] >= 30
+    assert sum(row["tx"] != "" for row in rows) == len(trajectory)
+    assert all(0.0 <= float(row["quality"]) <= 1.0 for row in rows)
+    assert digest(run_folder / "map") == before
+    again = call("localize", "--map", run_folder, tiny_room, "--output", out)
+    assert (again.returncode, "add --overwrite" in again.stderr) == (2, True)
+
+
+def test_one_image_is_placed_with_the_camera_of_the_map(
+    run_folder: Path, tiny_room: Path, tmp_path: Path
+) -> None:
+    done = call("localize", "--map", run_folder / "map", images(tiny_room)[12], "-o", tmp_path / "one")
+    assert done.returncode == 0, done.stderr
+    assert "position in the map" in done.stdout
+    assert "intrinsics are those of the map's camera" in done.stdout
+    assert len(read_tum_trajectory(tmp_path / "one" / "trajectory.txt")[0]) == 1
+
+
+def test_a_run_goes_on_from_the_map(
+    run_folder: Path, tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_out_plots(monkeypatch)
+    out = tmp_path / "more"
+    given = ("--map", run_folder, "--depth", "sensor", "--no-mesh")
+    done = call("run", tiny_room, *given, "--output", out)
+    assert done.returncode == 0, done.stderr
+    assert "never" not in done.stdout
+    grown = Map.load(out)
+    assert [session.name for session in grown.sessions] == ["room", "room"]
+    assert len(grown) >= len(Map.load(run_folder))
+    report = json.loads((out / "report.json").read_text())
+    assert report["options"]["start_map"] is True
+    assert report["tracked"] == 40
+    assert "that of the map it goes on from" in report["scale"]["sentence"]
+
+
+def test_what_cannot_be_used_is_refused_in_one_line(
+    run_folder: Path, tiny_room: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    cases = (
+        (("localize", "--map", tmp_path / "none", tiny_room), "no such folder"),
+        (("localize", "--map", tiny_room, tiny_room), "holds no map"),
+        (("localize", "--map", run_folder, tmp_path / "no.mp4"), "no such video file"),
+        (("run", tiny_room, "--map", tiny_room, "--depth", "sensor"), "holds no map"),
+        (("run", tiny_room, "--map", run_folder, "--odometry", "kiss-icp", "--depth", "sensor"), "kiss-icp"),
+        (("run", tiny_room, "--map", run_folder, "--features", "sift", "--depth", "sensor"), "features.name"),
+    )
+    for given, expected in cases:
+        done = call(*given, "--output", out)
+        assert done.returncode == 2, done.stdout
+        assert done.stderr.count("\n") == 1
+        assert expected in done.stderr
+        assert not out.exists()
