@@ -21,7 +21,7 @@ class Recording:
     """One recording of a batch.
 
     Attributes:
-        path: as ``slamdepth run`` takes it; addresses such as ``rtsp://...`` and ``camera:0`` stay.
+        path: as ``slamdepth run`` takes it; ``rtsp://...`` and ``camera:0`` stay as they are.
         options: of its line in a list, which come after those of the batch.
     """
 
