@@ -89,12 +89,6 @@ class MadeUpTracker:
     def __exit__(self, *error: object) -> None:
         self.closed = True
 
-    def ask_for_snapshot(self) -> None:
-        pass
-
-    def take_snapshot(self) -> None:
-        return None
-
     def finish(self) -> Reconstruction:
         placed = [i for i in self.seen if i not in self.lost]
         trajectory = Trajectory(np.array(placed) / 10.0, np.array([pose(i) for i in placed]))

@@ -86,15 +86,7 @@ class Recording(Dataset):
             ImageDecodeError: the image, or the depth image asked for, does not decode.
             CameraError: the size of either is not the camera's.
         """
-        if not 0 <= index < len(self):
-            raise IndexError(f"frame {index} of {len(self)}")
-        image_rgb = self._image(index)
-        width, height = self._size
-        if image_rgb.shape[:2] != (height, width):
-            raise CameraError(
-                f"{self.path}: frame {index} is {image_rgb.shape[1]}x{image_rgb.shape[0]}, others are "
-                f"{width}x{height}"
-            )
+        image_rgb = self._read(index)
         depth_m = None
         if with_depth and self._depth is not None:
             depth_m = self._depth(index)
@@ -107,6 +99,23 @@ class Recording(Dataset):
             self.camera,
             depth_m,
         )
+
+    def read_original(self, index: int) -> Frame:
+        """Read one frame in the size it was recorded in; raises as :meth:`read`."""
+        camera = self.camera.scaled(*self._size)
+        return Frame(index, float(self.timestamps_s[index]), self._read(index), camera)
+
+    def _read(self, index: int) -> Bytes:
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of {len(self)}")
+        image_rgb = self._image(index)
+        width, height = self._size
+        if image_rgb.shape[:2] != (height, width):
+            raise CameraError(
+                f"{self.path}: frame {index} is {image_rgb.shape[1]}x{image_rgb.shape[0]}, others are "
+                f"{width}x{height}"
+            )
+        return image_rgb
 
 
 class FileRecording(Recording):

@@ -154,6 +154,7 @@ class ViewedSequence:
 
     __iter__ = Dataset.__iter__
     frames = Dataset.frames
+    read_original = Dataset.read_original  # a view has one size
 
 
 def through_view(dataset: Dataset) -> Dataset:

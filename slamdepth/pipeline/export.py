@@ -7,12 +7,14 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from slamdepth.datasets import Dataset, open_dataset
+from slamdepth.datasets import Dataset, ReadOptions, open_dataset
+from slamdepth.datasets.intrinsics import Certainty
 from slamdepth.depth.gravity_consensus import GravityConsensus
 from slamdepth.errors import ConfigError, InputError, SlamdepthError
 from slamdepth.export import (
@@ -82,6 +84,8 @@ def export_run(
     dataset = None
     if kind.has_images and (mode is not ImageMode.NONE or scene.camera is None):
         dataset = _recording(folder, recording, camera)
+        if scene.camera is not None and dataset.camera_source.certainty is not Certainty.GIVEN:
+            dataset.camera = scene.camera  # the run found it from the motion
     if every_frame:
         scene = scene.with_all_frames()
     request = ExportRequest(scene, dataset, mode, progress or (lambda done, total: None))
@@ -241,11 +245,15 @@ def _report(folder: Path) -> dict[str, Any]:
 def _recording(folder: Path, recording: str | Path | None, camera: str | Path | None) -> Dataset:
     """The recording of a run, with the camera that it was run with."""
     arguments = recorded_arguments(folder)
-    if camera is None and "--camera" in arguments[:-1]:
-        camera = arguments[arguments.index("--camera") + 1]
+    given = dict(pairwise(arguments))
+    if camera is None:
+        camera = given.get("--camera")
+    reading = ReadOptions(
+        given.get("--topic"), given.get("--depth-topic"), follow_links="--follow-links" in arguments
+    )
     path = Path(recording) if recording is not None else Path(arguments[0]) if arguments else None
     if path is None:
         raise InputError(f"{folder}: does not say what was run: name it by --recording")
     if recording is None and not path.exists():
         raise InputError(f"{path}: the recording of this run is not there any more: name it by --recording")
-    return open_dataset(path, camera)
+    return open_dataset(path, camera, reading)
