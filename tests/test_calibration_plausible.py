@@ -39,7 +39,7 @@ def test_real_cameras_pass(camera: Camera) -> None:
 
 
 def with_distortion(*distortion: float) -> Camera:
-    return Camera(640, 480, 525.0, 525.0, 319.5, 239.5, distortion)  # type: ignore[arg-type]
+    return Camera(640, 480, 525.0, 525.0, 319.5, 239.5, distortion)
 
 
 @pytest.mark.parametrize(
