@@ -51,7 +51,7 @@ dist: $(VENV)/.dist
 	$(BIN)/twine check --strict dist/*
 
 check-dist: dist
-	$(BIN)/python packaging/check_dist.py dist $(if $(PYTHONS),--install $(PYTHONS))
+	$(BIN)/python .ci/check_dist.py dist $(if $(PYTHONS),--install $(PYTHONS))
 
 format: install-dev
 	$(BIN)/ruff check --fix .

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-CHECK = ROOT / "packaging" / "check_dist.py"
+CHECK = ROOT / ".ci" / "check_dist.py"
 
 
 @pytest.fixture(scope="module")

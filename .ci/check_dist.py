@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks the built wheel and sdist, and installs the wheel into empty environments.
 
-python packaging/check_dist.py dist                                   (``make check-dist``)
-python packaging/check_dist.py dist --install python3.10 python3.13   (needs a gigabyte for each)
+python .ci/check_dist.py dist                                   (``make check-dist``)
+python .ci/check_dist.py dist --install python3.10 python3.13   (needs a gigabyte for each)
 """
 
 from __future__ import annotations
