@@ -69,7 +69,7 @@ class Recording(Dataset):
         self.camera = replace(reduced_camera(camera, self.notes), fps=rate_hz)
         self.has_depth = depth is not None
         self._image, self._depth = image, depth
-        self._size = (camera.width, camera.height)
+        self._taken_by = replace(camera, fps=rate_hz)
 
     def __len__(self) -> int:
         return len(self.timestamps_s)
@@ -77,6 +77,23 @@ class Recording(Dataset):
     def files(self) -> Iterable[Path]:
         """See :meth:`slamdepth.datasets.base.Dataset.files`."""
         return self._files
+
+    def read_original(self, index: int) -> Frame:
+        """Read the colour image of a frame in its own size, with the camera of that size.
+
+        Raises:
+            IndexError, ImageDecodeError, CameraError: as :meth:`read`.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of {len(self)}")
+        image_rgb = self._image(index)
+        width, height = self._taken_by.width, self._taken_by.height
+        if image_rgb.shape[:2] != (height, width):
+            raise CameraError(
+                f"{self.path}: frame {index} is {image_rgb.shape[1]}x{image_rgb.shape[0]}, others are "
+                f"{width}x{height}"
+            )
+        return Frame(index, float(self.timestamps_s[index]), image_rgb, self._taken_by)
 
     def read(self, index: int, *, with_depth: bool = False) -> Frame:
         """Read one frame; see :meth:`slamdepth.datasets.base.Dataset.read`.
@@ -86,15 +103,7 @@ class Recording(Dataset):
             ImageDecodeError: the image, or the depth image asked for, does not decode.
             CameraError: the size of either is not the camera's.
         """
-        if not 0 <= index < len(self):
-            raise IndexError(f"frame {index} of {len(self)}")
-        image_rgb = self._image(index)
-        width, height = self._size
-        if image_rgb.shape[:2] != (height, width):
-            raise CameraError(
-                f"{self.path}: frame {index} is {image_rgb.shape[1]}x{image_rgb.shape[0]}, others are "
-                f"{width}x{height}"
-            )
+        image_rgb = self.read_original(index).image_rgb
         depth_m = None
         if with_depth and self._depth is not None:
             depth_m = self._depth(index)
