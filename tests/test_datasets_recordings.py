@@ -17,6 +17,7 @@ from sequences import CAMERA, depth_raw, image_rgb, poses, write_image
 
 from slamdepth.datasets import Dataset, known_readers, open_dataset, write_camera
 from slamdepth.datasets.intrinsics import Certainty
+from slamdepth.datasets.recording import Recording
 from slamdepth.errors import CameraError, DatasetError, InputError
 from slamdepth.io.imu import read_imu
 from slamdepth.types import Camera
@@ -125,6 +126,23 @@ def test_scannet(tmp_path: Path) -> None:
     depth_m = depth_of(dataset, 1)
     np.testing.assert_allclose(depth_m[::2, ::2], depth_raw(1) / 1000.0, rtol=1e-6)
     assert "BundleFusion" in dataset.truth_source
+
+
+def test_large_images_are_reduced_and_can_be_read_as_they_were(tmp_path: Path) -> None:
+    folder = made.make_scannet(tmp_path / "scene0000_00")
+    for image in (folder / "color").iterdir():
+        write_image(image, np.full((960, 1280, 3), 77, np.uint8))
+    larger = np.eye(4)
+    larger[:3, :3] = CAMERA.scaled(1280, 960).K
+    (folder / "intrinsic" / "intrinsic_color.txt").write_text(made.rows(larger))
+    dataset = open_dataset(folder)
+    assert isinstance(dataset, Recording)
+    frame, original = dataset.read(1, with_depth=True), dataset.read_original(1)
+    assert frame.image_rgb.shape == (480, 640, 3)
+    assert frame.depth_m is not None
+    assert original.image_rgb.shape == (960, 1280, 3)
+    np.testing.assert_allclose(original.camera.K, larger[:3, :3])
+    np.testing.assert_allclose(frame.camera.K, CAMERA.scaled(640, 480).K)
 
 
 @pytest.mark.parametrize("kind", [0, 1])

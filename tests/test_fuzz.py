@@ -7,9 +7,10 @@ from pathlib import Path
 
 import fuzz
 import pytest
+from fuzz_targets import targets
 
 CASES = 12
-TARGETS = {target.name: target for target in fuzz.targets(slow=False)}
+TARGETS = {target.name: target for target in targets(slow=False)}
 
 
 @pytest.mark.parametrize("name", TARGETS)

@@ -12,7 +12,6 @@ from slamdepth.calibration.camera_yaml import (
     make_camera,
     read_camera,
     read_values,
-    what_to_write,
 )
 from slamdepth.calibration.plausible import Pinhole, check_plausible
 from slamdepth.calibration.wide_lens import WIDE_MODELS, WideLens
@@ -27,5 +26,4 @@ __all__ = [
     "make_camera",
     "read_camera",
     "read_values",
-    "what_to_write",
 ]

@@ -148,15 +148,6 @@ def _made(path: Path, values: dict[Any, Any], make: Callable[..., _Camera]) -> _
         raise CameraError(f"{path}: {str(error).removeprefix('camera: ')}") from error
 
 
-def what_to_write(width: int, height: int) -> str:
-    """What a ``camera.yaml`` for images of this size has to hold, for a message."""
-    return (
-        f"the lines 'width: {width}', 'height: {height}', 'fx: ...', 'fy: ...', 'cx: ...', 'cy: ...' (pixels)"
-        " and, where they apply, 'distortion: [k1, k2, p1, p2, k3]', 'depth_factor: 5000' (raw depth units "
-        "per metre), 'fps: 30'"
-    )
-
-
 def camera_yaml(camera: Pinhole) -> str:
     """The text of a ``camera.yaml`` that reads back as an equal camera, should it be a plausible one."""
     values: dict[str, Any] = {key: int(getattr(camera, key)) for key in ("width", "height")}

@@ -78,6 +78,24 @@ class Recording(Dataset):
         """See :meth:`slamdepth.datasets.base.Dataset.files`."""
         return self._files
 
+    def read_original(self, index: int) -> Frame:
+        """Read the colour image of a frame in its own size, with the camera of that size.
+
+        Raises:
+            IndexError, ImageDecodeError, CameraError: as :meth:`read`.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of {len(self)}")
+        image_rgb = self._image(index)
+        width, height = self._size
+        if image_rgb.shape[:2] != (height, width):
+            raise CameraError(
+                f"{self.path}: frame {index} is {image_rgb.shape[1]}x{image_rgb.shape[0]}, others are "
+                f"{width}x{height}"
+            )
+        camera = self.camera.scaled(width, height)
+        return Frame(index, float(self.timestamps_s[index]), image_rgb, camera)
+
     def read(self, index: int, *, with_depth: bool = False) -> Frame:
         """Read one frame; see :meth:`slamdepth.datasets.base.Dataset.read`.
 
@@ -86,7 +104,7 @@ class Recording(Dataset):
             ImageDecodeError: the image, or the depth image asked for, does not decode.
             CameraError: the size of either is not the camera's.
         """
-        image_rgb = self._read(index)
+        image_rgb = self.read_original(index).image_rgb
         depth_m = None
         if with_depth and self._depth is not None:
             depth_m = self._depth(index)
@@ -99,23 +117,6 @@ class Recording(Dataset):
             self.camera,
             depth_m,
         )
-
-    def read_original(self, index: int) -> Frame:
-        """Read one frame in the size it was recorded in; raises as :meth:`read`."""
-        camera = self.camera.scaled(*self._size)
-        return Frame(index, float(self.timestamps_s[index]), self._read(index), camera)
-
-    def _read(self, index: int) -> Bytes:
-        if not 0 <= index < len(self):
-            raise IndexError(f"frame {index} of {len(self)}")
-        image_rgb = self._image(index)
-        width, height = self._size
-        if image_rgb.shape[:2] != (height, width):
-            raise CameraError(
-                f"{self.path}: frame {index} is {image_rgb.shape[1]}x{image_rgb.shape[0]}, others are "
-                f"{width}x{height}"
-            )
-        return image_rgb
 
 
 class FileRecording(Recording):

@@ -20,8 +20,9 @@ from slamdepth.backend.sights import Sights
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset
 from slamdepth.datasets.intrinsics import CameraSource, Certainty, camera_of_view
+from slamdepth.datasets.virtual_view import ViewedSequence
 from slamdepth.depth.base import DepthModel, is_sensor
-from slamdepth.errors import ImageDecodeError
+from slamdepth.errors import CameraError, ImageDecodeError
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
 from slamdepth.pipeline.prefetch import FramePrefetcher
 from slamdepth.report import CameraFacts
@@ -64,8 +65,10 @@ def use_view(dataset: Dataset, view_deg: float) -> None:
     """Give a dataset the camera that sees ``view_deg`` degrees across the longer side of its images.
 
     Raises:
-        CameraError: no pinhole camera has such a view.
+        CameraError: no pinhole camera has such a view, or the sequence has a wide lens.
     """
+    if isinstance(dataset, ViewedSequence):
+        raise CameraError(f"{dataset.path}: --fov is for lenses without a model; its camera file has one")
     camera = dataset.camera
     found = camera_of_view(camera.width, camera.height, view_deg)
     dataset.camera = replace(found, depth_factor=camera.depth_factor, fps=camera.fps)
@@ -93,7 +96,7 @@ def settle_camera(
     prior = prior_of(guess.fx, source, config)
     sigma = prior.sigma_log_f
     logger.info("intrinsics are not given: %s", source.how)
-    if config.odometry != "orb" or getattr(dataset, "is_live", False):
+    if config.odometry != "orb" or dataset.is_live:
         return OpeningCamera(source, None, sigma)
     passes: list[tuple[float, Sights]] = []
     settled: tuple[SelfCalibration, float] | None = None

@@ -506,7 +506,9 @@ def _reported_options(options: RunOptions, tracked: Tracked) -> dict[str, object
     asked = asdict(options)
     for name in ("sequence", "output", "overwrite", "camera_file", "start_map", "checkpoint_s"):
         asked.pop(name)
-    asked["reading"] = {name: value for name, value in asked["reading"].items() if value}
+    usual = asdict(ReadOptions())
+    reading = {name: value for name, value in asked.pop("reading").items() if value != usual[name]}
+    asked |= {"reading": reading} if reading else {}
     return {
         **asked,
         "camera_file": options.camera_file is not None,
