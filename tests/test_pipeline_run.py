@@ -74,6 +74,8 @@ def test_settings_come_from_a_file_and_the_depth_model_from_the_call(tiny_room: 
         "stride": 2,
         "mesh": False,
         "camera_file": True,
+        "start_map": False,
+        "map_images": False,
         "interrupted": False,
     }
 

@@ -34,6 +34,7 @@ from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.keyframe_policy import KeyframePolicy
 from slamdepth.tracking.local_mapper import LocalMapper
 from slamdepth.tracking.localiser import Localiser
+from slamdepth.tracking.prediction_state import prediction_of, prediction_state
 from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.tracking.workers import GravityInMap, Workers
 from slamdepth.types import Camera, Frame
@@ -51,6 +52,7 @@ class _Waiting:
     frames_left: int  # until its stages begin
     stages: Iterator[None]
     has_landmarks: bool = False
+    has_begun: bool = False
 
 
 class KeyframeIntegration:
@@ -91,14 +93,25 @@ class KeyframeIntegration:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether no keyframe waits, so that :meth:`state` is all there is to know."""
-        return not self._waiting and not self._is_adjusting
+        """Whether no keyframe is between two stages, so that :meth:`state` is all there is to know."""
+        return not self._is_adjusting and not any(waiting.has_begun for waiting in self._waiting)
 
     def state(self) -> Tree:
         """Everything it remembers, for a checkpoint; it must be quiet."""
         assert self.is_quiet
         readout = None if self._readout is None else self._readout.result()
+        depth = self._workers.depth
+        waiting = [
+            {
+                "keyframe": one.keyframe.id,
+                "frames_left": one.frames_left,
+                # what the image says of gravity is added by the time its depth is there
+                "prediction": prediction_state(depth.requested(one.keyframe.frame.load())),
+            }
+            for one in self._waiting
+        ]
         return {
+            "waiting": waiting,
             "readout": None if readout is None else [readout.readout_s, readout.readout_sigma_s],
             "loops": self.loops.state(),
             "policy": self._policy.state(),
@@ -114,6 +127,10 @@ class KeyframeIntegration:
         self.gravity.restore(state["gravity"])
         self._complete = [self._map.keyframes[k] for k in state["complete"]]
         self.mapper.dropped = state["dropped"]
+        for one in state["waiting"]:
+            keyframe = self._map.keyframes[one["keyframe"]]
+            self._workers.depth.restore(keyframe.frame.load(), prediction_of(one["prediction"]))
+            self._wait(keyframe, one["frames_left"])
         if state["readout"] is not None:
             self._readout = Future()
             self._readout.set_result(BundleResult.of_readout(*state["readout"]))
@@ -164,13 +181,17 @@ class KeyframeIntegration:
             )
         self._policy.keyframe_made()
         delay = 0 if depth.is_instant(frame) else self._config.tracking.depth_delay
-        words = self._workers.side.submit(self.loops.describe, keyframe.features)
-        waiting = _Waiting(keyframe, delay, iter(()))
-        waiting.stages = self._stages(waiting, words)
-        self._waiting.append(waiting)
+        self._wait(keyframe, delay)
         if len(self._map.keyframes) <= _WAITED_FOR or self._view_change.is_large:
             self.run_all()
         return keyframe
+
+    def _wait(self, keyframe: MapKeyframe, frames: int) -> None:
+        """Let a keyframe wait for so many frames before its stages begin."""
+        words = self._workers.side.submit(self.loops.describe, keyframe.features)
+        waiting = _Waiting(keyframe, frames, iter(()))
+        waiting.stages = self._stages(waiting, words)
+        self._waiting.append(waiting)
 
     def _stages(self, waiting: _Waiting, words: Future[NDArray[np.float32]]) -> Iterator[None]:
         """What follows a keyframe's depth; a frame is tracked at each ``yield``."""
@@ -234,6 +255,7 @@ class KeyframeIntegration:
 
     def run_stage(self) -> None:
         """Run the next stage of the oldest waiting keyframe."""
+        self._waiting[0].has_begun = True
         is_complete = next(self._waiting[0].stages, _COMPLETE) is _COMPLETE
         if is_complete:
             del self._waiting[0]

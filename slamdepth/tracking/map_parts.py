@@ -121,8 +121,9 @@ class MapParts:
         self.is_loaded = False
 
     def state(self) -> Tree:
-        """Everything the map and its parts remember, for a checkpoint; no keyframe waits."""
+        """Everything the map and its parts remember, for a checkpoint; no keyframe is between stages."""
         map_ = self.map
+        integration = self.integration.state()  # first: it waits for threads that add to other parts
         return {
             "id": self.id,
             "is_loaded": self.is_loaded,
@@ -137,7 +138,7 @@ class MapParts:
             "shutter": self.shutter.state(),
             "check": self.check.state(),
             "view_change": self.view_change.state(),
-            "integration": self.integration.state(),
+            "integration": integration,
             "relocaliser": self.relocaliser.state(),
         }
 
@@ -153,7 +154,11 @@ class MapParts:
         def read(number: int, frame: StoredFrame) -> Callable[[], DepthPrediction] | None:
             return partial(stored.read_prediction, frame) if sessions[number] == session else None
 
+        waiting = {one["keyframe"] for one in state["integration"]["waiting"]}
+
         def frame_of(number: int, index: int, timestamp_s: float, gravity: Floats | None) -> StoredFrame:
+            if number in waiting:
+                return StoredFrame(stored.read_frame(index))
             reader = partial(stored.read_frame, index) if sessions[number] == session else None
             return StoredFrame.of_saved(index, timestamp_s, self._run.camera, gravity, reader)
 

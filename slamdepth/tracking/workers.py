@@ -128,6 +128,19 @@ class DepthWorker:
         if not self._is_last(frame) and all(requested is not frame for requested, _ in self._requested):
             self._requested.append((frame, self._pool.submit(self._predict, frame, gravity)))
 
+    def requested(self, frame: Frame) -> DepthPrediction:
+        """The prediction that was requested for ``frame`` and not taken yet; waits for it."""
+        if self._last is not None and self._last[0] is frame:
+            return self._last[1]
+        futures = (future for requested, future in self._requested if requested is frame)
+        return (next(futures, None) or self._pool.submit(self._predict, frame, None)).result()
+
+    def restore(self, frame: Frame, prediction: DepthPrediction) -> None:
+        """As if ``frame`` had been requested, and predicted."""
+        future: Future[DepthPrediction] = Future()
+        future.set_result(prediction)
+        self._requested.append((frame, future))
+
     def _predict(self, frame: Frame, gravity: GravityInMap | None) -> DepthPrediction:
         if gravity is None or frame.gravity is not None:
             prediction = self._model.predict(frame)
