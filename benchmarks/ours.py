@@ -8,7 +8,7 @@ from benchmarks.system import Estimate
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
 from slamdepth.pipeline.results import keyframe_trajectory
-from slamdepth.pipeline.run import seed_everything, seed_torch
+from slamdepth.pipeline.seeds import seed_everything, seed_torch
 from slamdepth.tracking import create_tracker
 from slamdepth.types import Camera, Frame
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from slamdepth.config import Config
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.metric import configured_model
-from slamdepth.pipeline.run import seed_everything, seed_torch
+from slamdepth.pipeline.seeds import seed_everything, seed_torch
 
 
 def seeded_depth_model(name: str, config: Config) -> DepthModel:

@@ -15,8 +15,8 @@ from slamdepth.config import Config
 from slamdepth.errors import CameraError, ConfigError, DatasetError, ImageDecodeError
 from slamdepth.io import read_tum_trajectory
 from slamdepth.pipeline import RunInterrupted, RunOptions, RunProgress, RunStage, tracking
+from slamdepth.pipeline.asked import settings_text
 from slamdepth.pipeline.prefetch import FramePrefetcher, ReadFrame
-from slamdepth.pipeline.run import _settings_text
 from slamdepth.pipeline.tracking import Tracked, track
 from slamdepth.types import Frame
 
@@ -172,7 +172,7 @@ def test_options_out_of_range(wrong: dict[str, int]) -> None:
 
 def test_the_settings_file_gives_the_same_settings_again(tmp_path: Path) -> None:
     config = Config.from_dict({"seed": 7, "map": {"voxel_size_m": 0.05}, "odometry": "kiss-icp"})
-    (tmp_path / "config.yaml").write_text(_settings_text(RunOptions(Path("s"), max_frames=3), config))
+    (tmp_path / "config.yaml").write_text(settings_text(RunOptions(Path("s"), max_frames=3), config))
     assert Config.from_yaml(tmp_path / "config.yaml") == config
 
 

@@ -11,9 +11,9 @@ import pytest
 
 from slamdepth.errors import OutputError
 from slamdepth.io import writable_file
+from slamdepth.pipeline.asked import arguments_of
 from slamdepth.pipeline.folder import FILES, MAPS, RunFolder, run_log, write_log_to
 from slamdepth.pipeline.options import RunOptions
-from slamdepth.pipeline.run import _arguments
 
 
 def test_a_default_run_folder_is_always_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,7 +127,7 @@ def test_the_readme_lists_every_file(tmp_path: Path) -> None:
 
 
 def test_the_readme_has_the_command_for_the_same_run_again(tmp_path: Path) -> None:
-    arguments = _arguments(RunOptions(Path("my desk"), None, Path("c.yaml"), 60, 2, mesh=False))
+    arguments = arguments_of(RunOptions(Path("my desk"), None, Path("c.yaml"), 60, 2, mesh=False))
     folder = RunFolder.plan(tmp_path / "run", "desk", overwrite=False)
     folder.create(arguments)
     assert (folder / "README.txt").read_text().splitlines()[-1] == (
@@ -135,7 +135,7 @@ def test_the_readme_has_the_command_for_the_same_run_again(tmp_path: Path) -> No
         f"--config {shlex.quote(str(folder / 'config.yaml'))}"
     )
     assert RunFolder.plan(tmp_path / "run", "desk", overwrite=True).replaces
-    assert _arguments(RunOptions(Path("desk"))) == ["desk"]
+    assert arguments_of(RunOptions(Path("desk"))) == ["desk"]
 
 
 def test_the_log_has_what_was_said_before_there_was_a_folder(tmp_path: Path) -> None:

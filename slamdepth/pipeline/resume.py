@@ -13,8 +13,9 @@ from slamdepth.datasets import ReadOptions
 from slamdepth.errors import DatasetError
 from slamdepth.pipeline.checkpoint import read_begun, read_latest
 from slamdepth.pipeline.folder import is_run
+from slamdepth.pipeline.job import Begun
 from slamdepth.pipeline.options import ProgressCallback, RunOptions, RunResult
-from slamdepth.pipeline.run import Begun, run_job
+from slamdepth.pipeline.run import run_job
 
 logger = logging.getLogger(__name__)
 
