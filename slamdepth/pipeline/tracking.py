@@ -272,7 +272,7 @@ class _Online:
 
 
 def _checkpoint(tracker: Tracker, checkpoints: Checkpoints, run: _Run) -> None:
-    """Write a checkpoint, unless a keyframe waits; then one of the next frames will."""
+    """Write a checkpoint, unless a keyframe is between two stages; then one of the next frames will."""
     if tracker.is_quiet:
         checkpoints.write(tracker, run.so_far)
 
