@@ -10,6 +10,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+RUNNING = (ROOT / "docs" / "running.md").read_text(encoding="utf-8")
+CAMERA = (ROOT / "docs" / "camera.md").read_text(encoding="utf-8")
 RECORD = ROOT / "docs" / "experiments"
 """Dated files, which name modules of their day."""
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *RECORD.glob("*.md")])
@@ -20,8 +22,8 @@ def name_of(document: Path) -> str:
     return document.relative_to(ROOT).as_posix()
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+def blocks(language: str, text: str = README) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def anchors(document: Path) -> set[str]:
@@ -46,7 +48,7 @@ def test_the_python_example_runs(
 def test_the_camera_file_can_be_read(tmp_path: Path) -> None:
     import slamdepth
 
-    (text,) = blocks("yaml")
+    (text,) = blocks("yaml", CAMERA)
     (tmp_path / "camera.yaml").write_text(text)
     assert slamdepth.Camera.from_file(tmp_path / "camera.yaml").width == 640
 
@@ -57,7 +59,7 @@ def test_the_commands_exist() -> None:
     from slamdepth.cli.app import app
 
     known = set(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
-    named = set(re.findall(r"^slamdepth ([a-z-]+)", "".join(blocks("sh")), re.MULTILINE))
+    named = set(re.findall(r"^slamdepth ([a-z-]+)", "".join(blocks("sh") + blocks("sh", RUNNING)), re.MULTILINE))
     assert named
     assert named <= known
 
@@ -65,7 +67,7 @@ def test_the_commands_exist() -> None:
 def test_the_run_folder_is_explained() -> None:
     from slamdepth.pipeline.folder import FILES
 
-    section = README.split("### Output files")[1].split("###")[0]
+    section = RUNNING.split("## Output files")[1].split("\n## ")[0]
     assert set(re.findall(r"`(\w+\.(?:txt|ply|png|html|json|yaml|safetensors))`", section)) == set(FILES)
 
 

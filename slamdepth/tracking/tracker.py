@@ -28,6 +28,7 @@ from slamdepth.thread_limits import single_threaded
 from slamdepth.tracking.atlas import Atlas
 from slamdepth.tracking.finish import finish_run
 from slamdepth.tracking.frame_log import check_frame
+from slamdepth.tracking.keypoint_alignment import align_keypoints
 from slamdepth.tracking.map_parts import RunParts, StoredKeyframes
 from slamdepth.tracking.map_tracker import MapTracker, Placed
 from slamdepth.tracking.saved_maps import MapInfo, load_map, save_map
@@ -331,6 +332,9 @@ def sights_seen(tracker: object) -> Sights | None:
         tracker._workers.between.wait()
         with single_threaded():
             tracker._active.integration.run_all()
+            for one in tracker._atlas.maps:
+                if tracker.config.bundle.align and not one.is_loaded:
+                    align_keypoints(one.map, one.shutter, one.localiser.levels)
     return sights_of(tracker._atlas.maps, tracker.camera)
 
 
