@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,15 +45,37 @@ _MAX_WAITING = 2  # keyframes; with three, landmarks are missed that the oldest 
 _WAITED_FOR = 4  # first keyframes whose depth is waited for: all that follows builds on their landmarks
 
 
+class _Stage(IntEnum):
+    """What is next for a keyframe."""
+
+    LANDMARKS = 0
+    ADJUSTMENT = 1
+    LOOP = 2
+    ADJUSTMENT_OF_LOOP = 3
+    END = 4
+
+
 @dataclass
 class _Waiting:
-    """A keyframe whose integration is not complete."""
+    """A keyframe whose integration is not complete.
+
+    Attributes:
+        frames_left: until its stages begin.
+        stage: that is next.
+        neighbours: keyframes that are still to be searched for its landmarks.
+        is_in_stage: a stage has begun and has not ended.
+    """
 
     keyframe: MapKeyframe
-    frames_left: int  # until its stages begin
-    stages: Iterator[None]
-    has_landmarks: bool = False
-    has_begun: bool = False
+    frames_left: int
+    stages: Iterator[None] = field(default_factory=lambda: iter(()))
+    stage: _Stage = _Stage.LANDMARKS
+    neighbours: list[int] = field(default_factory=list)
+    is_in_stage: bool = False
+
+    @property
+    def has_landmarks(self) -> bool:
+        return self.stage > _Stage.LANDMARKS
 
 
 class KeyframeIntegration:
@@ -93,31 +116,33 @@ class KeyframeIntegration:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether no keyframe is between two stages, so that :meth:`state` is all there is to know."""
-        return not self._is_adjusting and not any(waiting.has_begun for waiting in self._waiting)
+        """Whether no keyframe is in the middle of a stage, so that :meth:`state` is all there is to know."""
+        return not any(waiting.is_in_stage for waiting in self._waiting)
 
     def state(self) -> Tree:
         """Everything it remembers, for a checkpoint; it must be quiet."""
         assert self.is_quiet
         readout = None if self._readout is None else self._readout.result()
-        depth = self._workers.depth
-        waiting = [
-            {
-                "keyframe": one.keyframe.id,
-                "frames_left": one.frames_left,
-                # what the image says of gravity is added by the time its depth is there
-                "prediction": prediction_state(depth.requested(one.keyframe.frame.load())),
-            }
-            for one in self._waiting
-        ]
         return {
-            "waiting": waiting,
+            "waiting": [self._waiting_state(one) for one in self._waiting],
             "readout": None if readout is None else [readout.readout_s, readout.readout_sigma_s],
             "loops": self.loops.state(),
             "policy": self._policy.state(),
             "gravity": self.gravity.state(),
             "complete": [keyframe.id for keyframe in self._complete],
             "dropped": self.mapper.dropped,
+        }
+
+    def _waiting_state(self, waiting: _Waiting) -> Tree:
+        keyframe = waiting.keyframe
+        # what the image says of gravity is added by the time its depth is there
+        requested = None if waiting.has_landmarks else self._workers.depth.requested(keyframe.frame.load())
+        return {
+            "keyframe": keyframe.id,
+            "frames_left": waiting.frames_left,
+            "prediction": None if requested is None else prediction_state(requested),
+            "stage": int(waiting.stage),
+            "neighbours": waiting.neighbours,
         }
 
     def restore(self, state: Tree) -> None:
@@ -129,8 +154,10 @@ class KeyframeIntegration:
         self.mapper.dropped = state["dropped"]
         for one in state["waiting"]:
             keyframe = self._map.keyframes[one["keyframe"]]
-            self._workers.depth.restore(keyframe.frame.load(), prediction_of(one["prediction"]))
-            self._wait(keyframe, one["frames_left"])
+            if one["prediction"] is not None:
+                self._workers.depth.restore(keyframe.frame.load(), prediction_of(one["prediction"]))
+            stage, neighbours = _Stage(one["stage"]), list(one["neighbours"])
+            self._wait(_Waiting(keyframe, one["frames_left"], stage=stage, neighbours=neighbours))
         if state["readout"] is not None:
             self._readout = Future()
             self._readout.set_result(BundleResult.of_readout(*state["readout"]))
@@ -181,45 +208,52 @@ class KeyframeIntegration:
             )
         self._policy.keyframe_made()
         delay = 0 if depth.is_instant(frame) else self._config.tracking.depth_delay
-        self._wait(keyframe, delay)
+        self._wait(_Waiting(keyframe, delay))
         if len(self._map.keyframes) <= _WAITED_FOR or self._view_change.is_large:
             self.run_all()
         return keyframe
 
-    def _wait(self, keyframe: MapKeyframe, frames: int) -> None:
-        """Let a keyframe wait for so many frames before its stages begin."""
-        words = self._workers.side.submit(self.loops.describe, keyframe.features)
-        waiting = _Waiting(keyframe, frames, iter(()))
+    def _wait(self, waiting: _Waiting) -> None:
+        """Let a keyframe wait for its stages."""
+        words = self._workers.side.submit(self.loops.describe, waiting.keyframe.features)
         waiting.stages = self._stages(waiting, words)
         self._waiting.append(waiting)
 
     def _stages(self, waiting: _Waiting, words: Future[NDArray[np.float32]]) -> Iterator[None]:
-        """What follows a keyframe's depth; a frame is tracked at each ``yield``."""
+        """What follows a keyframe's depth, from its stage on; a frame is tracked at each ``yield``."""
         keyframe = waiting.keyframe
-        prediction = self._workers.depth.take(keyframe.frame.load())
-        with self._timed("mapping"):
-            self._update_velocity(keyframe)
-            self.mapper.add_depth(keyframe, prediction)
-            neighbours = self.mapper.neighbours(keyframe)
-            self.mapper.search(keyframe, neighbours[::2])
-        waiting.has_landmarks = True
-        self._policy.landmarks_created()
-        yield
-        yield from self._search_and_adjust(keyframe, neighbours[1::2])
-        yield
-        with self._timed("loops"):
-            closure = self.loops.close(keyframe, words.result())
-        if closure is not None:  # tie the two sides of the loop together by what both see
+        if waiting.stage == _Stage.LANDMARKS:
+            prediction = self._workers.depth.take(keyframe.frame.load())
+            with self._timed("mapping"):
+                self._update_velocity(keyframe)
+                self.mapper.add_depth(keyframe, prediction)
+                neighbours = self.mapper.neighbours(keyframe)
+                self.mapper.search(keyframe, neighbours[::2])
+            waiting.stage, waiting.neighbours = _Stage.ADJUSTMENT, neighbours[1::2]
+            self._policy.landmarks_created()
             yield
-            yield from self._search_and_adjust(keyframe, self.mapper.neighbours(keyframe))
+        if waiting.stage == _Stage.ADJUSTMENT:
+            yield from self._search_and_adjust(waiting, waiting.neighbours)
+            waiting.stage = _Stage.LOOP
+            yield
+        if waiting.stage == _Stage.LOOP:
+            with self._timed("loops"):
+                closure = self.loops.close(keyframe, words.result())
+            waiting.stage = _Stage.END if closure is None else _Stage.ADJUSTMENT_OF_LOOP
+            if closure is not None:
+                yield
+        if waiting.stage == _Stage.ADJUSTMENT_OF_LOOP:  # tie its two sides together by what both see
+            yield from self._search_and_adjust(waiting, self.mapper.neighbours(keyframe))
+            waiting.stage = _Stage.END
             yield
         with self._timed("mapping"):
             self._map.cull(keyframe)
             self._map.spill_images()
         self._complete.append(keyframe)
 
-    def _search_and_adjust(self, keyframe: MapKeyframe, neighbours: list[int]) -> Iterator[None]:
+    def _search_and_adjust(self, waiting: _Waiting, neighbours: list[int]) -> Iterator[None]:
         """Search the keyframe's landmarks in ``neighbours`` and adjust the window in the side thread."""
+        keyframe, waiting.is_in_stage = waiting.keyframe, True
         with self._timed("mapping"):
             self.mapper.search(keyframe, neighbours)
         with self._timed("bundle"):
@@ -234,6 +268,7 @@ class KeyframeIntegration:
                 self._is_adjusting = False
             if self._shutter.is_due(keyframe.id + 1):
                 self._readout = self.adjuster.begin_readout()
+        waiting.is_in_stage = False
 
     def run_all(self) -> bool:
         """Complete the integration of all waiting keyframes; False where none waits."""
@@ -255,7 +290,6 @@ class KeyframeIntegration:
 
     def run_stage(self) -> None:
         """Run the next stage of the oldest waiting keyframe."""
-        self._waiting[0].has_begun = True
         is_complete = next(self._waiting[0].stages, _COMPLETE) is _COMPLETE
         if is_complete:
             del self._waiting[0]

@@ -298,9 +298,9 @@ class Tracker:
         if not any(len(map_.frames) for map_ in self._atlas.maps):
             raise TrackingError("no frame could be placed in the map that the run goes on from")
         self._watch.next_frame()
-        self.complete()
-        self._finished = True
         with self, single_threaded():
+            self.complete()
+            self._finished = True
             return finish_run(self._atlas, self.config, self._watch, self._steps)
 
     def close(self) -> None:
