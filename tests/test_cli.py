@@ -70,7 +70,7 @@ def test_a_run_says_first_whether_it_can_be_trusted(run_folder: Path, report: di
 def test_a_run_writes_everything_it_promises(run_folder: Path) -> None:
     promised = (
         "trajectory_online.txt trajectory.txt keyframes.txt mesh.ply cloud.ply mesh.png report.json "
-        "report.html scene.safetensors config.yaml log.txt README.txt"
+        "report.html scene.safetensors config.yaml log.txt README.txt map"
     )
     assert {path.name for path in run_folder.iterdir()} == {*promised.split(), "stdout.txt"}
     online, _ = read_tum_trajectory(run_folder / "trajectory_online.txt")

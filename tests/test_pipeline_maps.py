@@ -30,7 +30,7 @@ FRAMES = 24
 
 @pytest.fixture(autouse=True)
 def two_maps_and_no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    def create_tracker(camera: Camera, *, depth_model: Any, config: Config) -> Tracker:
+    def create_tracker(camera: Camera, *, depth_model: Any, config: Config, start_map: None) -> Tracker:
         return TwoMapTracker(camera, depth_model=depth_model, config=config)
 
     monkeypatch.setattr("slamdepth.tracking.create_tracker", create_tracker)

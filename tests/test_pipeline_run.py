@@ -76,6 +76,8 @@ def test_settings_come_from_a_file_and_the_depth_model_from_the_call(tiny_room: 
         "camera_file": True,
         "start_map": False,
         "map_images": False,
+        "exports": (),
+        "view_deg": None,
         "interrupted": False,
     }
 

@@ -59,7 +59,9 @@ def test_the_commands_exist() -> None:
     from slamdepth.cli.app import app
 
     known = set(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
-    named = set(re.findall(r"^slamdepth ([a-z-]+)", "".join(blocks("sh") + blocks("sh", RUNNING)), re.MULTILINE))
+    named = set(
+        re.findall(r"^slamdepth ([a-z-]+)", "".join(blocks("sh") + blocks("sh", RUNNING)), re.MULTILINE)
+    )
     assert named
     assert named <= known
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
+
 from slamdepth.errors import TrackingError
 from slamdepth.mapping.codec import encode_half_precision, encode_image, encode_sensor_depth
 from slamdepth.mapping.spill_file import SpilledArray, SpillFile
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
 _NEWEST = 8  # never spilled: tracking still reads them
@@ -84,6 +85,16 @@ class StoredFrame:
         return Frame(
             self.index, self.timestamp_s, self._image.load(), self.camera, depth_m, gravity=self.gravity
         )
+
+    def load_as_spilled(self) -> NDArray[np.uint8]:
+        """The image ``(H, W, 3)`` as a spilled one is read back, whether it was spilled or not.
+
+        What it decides does not depend on how much memory there is. Raises as :meth:`load`.
+        """
+        if self._resident is None and self._image is not None:
+            return np.asarray(self._image.load())
+        encoded = encode_image(self.load().image_rgb)
+        return np.asarray(encoded.decode(encoded.data))
 
     def _spill(self, file: SpillFile) -> None:
         """Move the images to ``file``."""

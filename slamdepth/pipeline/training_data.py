@@ -140,7 +140,7 @@ class SynthReader(SequenceReader):
 
 def sequence_readers() -> dict[str, PlaceReader]:
     """Readers of every sequence layout; ``synth`` comes before ``tum``, whose layout it shares."""
-    layouts = {reader.name: reader for reader in known_readers()}
+    layouts = {reader.name: reader for reader in known_readers() if reader.name != "live"}
     readers: dict[str, PlaceReader] = {"synth": SynthReader(layouts["tum"])}
     readers.update({name: SequenceReader(reader) for name, reader in layouts.items()})
     return readers

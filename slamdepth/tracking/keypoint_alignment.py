@@ -152,7 +152,7 @@ class _Batch:
             at = references.feature[landmark_ids[of_keyframe == number]]
             # finer than the level of the detector, which is where its error comes from
             spacing_px = np.sqrt(features.sigma_px[at])
-            image = ImagePyramid(keyframe.frame.load().image_rgb)
+            image = ImagePyramid(keyframe.frame.load_as_spilled())
             parts.append(Templates.of(image, features.raw_px[at], spacing_px))
         return cls(map_, references, place, Templates.joined(parts))
 
@@ -167,7 +167,7 @@ class _Batch:
         at, ids = at[known & is_other], ids[known & is_other]
         if len(at) == 0:
             return keypoints
-        image = ImagePyramid(keyframe.frame.load().image_rgb)
+        image = ImagePyramid(keyframe.frame.load_as_spilled())
         warp = _warp(self.map_, keyframe, ids, self.references.keyframe[ids])
         px, correlation = align(image, self.templates.taken(self.place[ids]), warp, keypoints.raw_px[at])
         zoom = np.sqrt(np.abs(np.linalg.det(warp)))
