@@ -60,6 +60,15 @@ def test_a_bag_is_placed_by_the_topic_that_is_asked_for(
     assert json.loads((out / "localized.json").read_text())["placed"] == 3
 
 
+def test_a_run_does_not_replace_the_map_it_goes_on_from(run_folder: Path, tiny_room: Path) -> None:
+    before = digest(run_folder / "map")
+    asked = ("run", tiny_room, "--depth", "sensor", "--map", run_folder, "--output", run_folder)
+    done = call(*asked, "--overwrite")
+    assert done.returncode == 2
+    assert "which would be removed with the run there" in done.stderr
+    assert digest(run_folder / "map") == before
+
+
 def test_a_live_source_is_not_placed(run_folder: Path, tmp_path: Path) -> None:
     done = call("localize", "--map", run_folder, "http://me:secret@127.0.0.1:9/video")
     assert done.returncode == 2
