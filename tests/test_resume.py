@@ -142,6 +142,18 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again(
     assert json.loads((folder / "report.json").read_text())["frames"] == 3 * 78
 
 
+@pytest.mark.parametrize(
+    "given", [("--max-frames", 5), ("--output", "elsewhere"), ("--no-mesh",), ("--seed", 0), ("--view",)]
+)
+def test_options_that_a_resumed_run_would_not_heed_are_refused(
+    tmp_path: Path, given: tuple[object, ...]
+) -> None:
+    done = call("run", "--resume", tmp_path, *given)
+    assert done.returncode == 2
+    assert f"the options that the run had: leave out {given[0]}" in done.stderr
+    assert "holds no run" in call("run", "--resume", tmp_path, "--quiet").stderr
+
+
 def test_a_run_goes_on_from_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "imu.csv").write_text("")
     monkeypatch.chdir(tmp_path)
