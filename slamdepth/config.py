@@ -305,10 +305,13 @@ class Config(_Section):
         except ValidationError as error:
             raise ConfigError(f"{origin}: {_first_problem(error)}") from error
 
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as nested dicts for :meth:`from_dict`, whatever folder they are read back in."""
+        return self._with_files(lambda name: str(Path(name).expanduser().absolute()))
+
     def to_yaml(self) -> str:
         """The settings as YAML that :meth:`from_yaml` reads back, whatever folder it is read from."""
-        values = self._with_files(lambda name: str(Path(name).expanduser().absolute()))
-        return yaml.safe_dump(values, sort_keys=False)
+        return yaml.safe_dump(self.to_dict(), sort_keys=False)
 
     def for_report(self) -> dict[str, Any]:
         """The settings as nested dicts; files by their names only, as reports are passed on."""

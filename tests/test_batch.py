@@ -124,6 +124,37 @@ def test_names_stay_with_their_recordings(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("pretend")
+def test_a_recording_never_takes_the_folder_of_another(tmp_path: Path) -> None:
+    run_batch(recordings("a/walk.mp4"), tmp_path / "b")
+    other = run_batch(recordings("b/walk.mp4"), tmp_path / "b")
+    third = run_batch(recordings("c/walk.mp4"), tmp_path / "b")
+    assert [run["runs"][0]["name"] for run in (other, third)] == ["walk-2", "walk-3"]
+    assert (tmp_path / "b" / "walk" / "starts").read_text().count("\n") == 1
+
+
+@pytest.mark.usefixtures("pretend")
+def test_one_recording_may_be_run_with_several_options(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text("walk --seed 1\nwalk --seed 2\nwalk --seed 1\n")
+    found = find_recordings([str(tmp_path / "list.txt")])
+    assert [one.options for one in found] == [("--seed", "1"), ("--seed", "2")]
+    first = run_batch(found, tmp_path / "b")
+    again = run_batch(found[::-1], tmp_path / "b")
+    assert [run["name"] for run in first["runs"]] == ["walk", "walk-2"]
+    assert [run["name"] for run in again["runs"]] == ["walk-2", "walk"]
+    assert again["not_repeated"] == ["walk-2", "walk"]
+
+
+@pytest.mark.usefixtures("pretend")
+def test_secrets_of_an_address_are_not_written_down(tmp_path: Path) -> None:
+    found = recordings("rtsp://me:secret@cam.lan?key=secret")
+    run_batch(found, tmp_path / "b")
+    again = run_batch(found, tmp_path / "b")
+    assert again["not_repeated"] == ["cam"]
+    assert "secret" not in (tmp_path / "b" / "batch.json").read_text()
+    assert "secret" not in (tmp_path / "b" / "batch.html").read_text()
+
+
+@pytest.mark.usefixtures("pretend")
 def test_stopping_ends_what_runs_and_starts_no_more(tmp_path: Path) -> None:
     stop = threading.Event()
 

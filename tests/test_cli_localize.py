@@ -7,10 +7,12 @@ import csv
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from bags import BagWriter
 from command_line import call, images, leave_out_plots, slamdepth
 
-from slamdepth import Map
+from slamdepth import Map, open_dataset
 from slamdepth.io import read_tum_trajectory
 
 
@@ -38,6 +40,40 @@ def test_a_run_leaves_a_map(run_folder: Path) -> None:
     estimate, _ = read_tum_trajectory(run_folder / "trajectory.txt")
     assert saved.trajectory().T_world_camera == pytest.approx(estimate.T_world_camera, abs=1e-6)
     assert "map/" in (run_folder / "README.txt").read_text()
+
+
+def test_a_bag_is_placed_by_the_topic_that_is_asked_for(
+    run_folder: Path, tiny_room: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("rosbags")
+    dataset = open_dataset(tiny_room)
+    with BagWriter(tmp_path / "two.bag", "ros1") as bag:
+        for frame in (dataset.read(index) for index in range(3)):
+            time_s = frame.timestamp_s + 1.0
+            for topic, image in (("/a", np.zeros_like(frame.image_rgb)), ("/room", frame.image_rgb)):
+                bag.write(f"{topic}/image_raw", bag.image(time_s, topic, image, "rgb8"), time_s)
+                info = bag.camera_info(time_s, topic, dataset.camera)
+                bag.write(f"{topic}/camera_info", info, time_s)
+    out = tmp_path / "found"
+    asked = ("localize", "--map", run_folder, tmp_path / "two.bag", "--output", out)
+    assert call(*asked, "--topic", "/room/image_raw").returncode == 0
+    assert json.loads((out / "localized.json").read_text())["placed"] == 3
+
+
+def test_a_run_does_not_replace_the_map_it_goes_on_from(run_folder: Path, tiny_room: Path) -> None:
+    before = digest(run_folder / "map")
+    asked = ("run", tiny_room, "--depth", "sensor", "--map", run_folder, "--output", run_folder)
+    done = call(*asked, "--overwrite")
+    assert done.returncode == 2
+    assert "which would be removed with the run there" in done.stderr
+    assert digest(run_folder / "map") == before
+
+
+def test_a_live_source_is_not_placed(run_folder: Path, tmp_path: Path) -> None:
+    done = call("localize", "--map", run_folder, "http://me:secret@127.0.0.1:9/video")
+    assert done.returncode == 2
+    assert "is a live source; only recordings are placed" in done.stderr
+    assert "secret" not in done.stderr
 
 
 def test_a_sequence_is_placed_in_the_map(run_folder: Path, tiny_room: Path, tmp_path: Path) -> None:

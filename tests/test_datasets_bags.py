@@ -57,6 +57,17 @@ def write_bag(path: Path, kind: str, extra: Callable[[BagWriter], None] | None =
     return path
 
 
+def test_topics_with_poses_are_named_until_one_is_taken(tmp_path: Path) -> None:
+    def poses(bag: BagWriter) -> None:
+        bag.write("/vicon/pose", bag.pose(100.0, "world", np.eye(4)), 100.0)
+
+    path = write_bag(tmp_path / "a.bag", "ros1", poses)
+    told = "topics with poses, not used: /vicon/pose; --pose-topic takes one as truth"
+    assert told in open_dataset(path).notes
+    taken = open_dataset(path, options=ReadOptions(pose_topic="/vicon/pose"))
+    assert told not in taken.notes
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_bag_is_read_without_a_camera_file(tmp_path: Path, kind: str) -> None:
     dataset = open_dataset(write_bag(bag_path(tmp_path, kind), kind))

@@ -53,6 +53,15 @@ def test_images_come_in_natural_order_at_the_rate_of_the_camera_file(tmp_path: P
         dataset.read(3)
 
 
+def test_a_run_folder_is_not_taken_as_images(tmp_path: Path) -> None:
+    folder_of(tmp_path, ("mesh.png",), None)
+    for name in ("report.json", "trajectory_online.txt", "config.yaml"):
+        open_dataset(tmp_path)
+        (tmp_path / name).write_text("")
+    with pytest.raises(DatasetError, match="is the folder of a run, not a recording"):
+        open_dataset(tmp_path)
+
+
 def test_a_named_camera_file_overrules_the_one_inside(tmp_path: Path) -> None:
     folder = folder_of(tmp_path / "walk")
     write_camera(tmp_path / "own.yaml", Camera(16, 12, 30.0, 30.0, 7.5, 5.5))

@@ -28,7 +28,8 @@ from slamdepth.geometry import invert, se3_exp
 from slamdepth.io import read_tum_trajectory
 from slamdepth.open3d_loader import import_open3d
 from slamdepth.pipeline import RunResult
-from slamdepth.pipeline.folder import recorded_arguments
+from slamdepth.pipeline.export import _recording
+from slamdepth.pipeline.folder import RunFolder, recorded_arguments
 from slamdepth.types import Camera, Frame, Trajectory
 
 ALL = ("colmap", "euroc", "glb", "kitti", "nerfstudio", "obj", "ply", "tum")
@@ -238,6 +239,27 @@ def test_a_damaged_run_is_one_line(
     assert says in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (run / "export" / to).exists()
+
+
+def test_the_images_of_a_pattern_are_found_again(tmp_path: Path) -> None:
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"img_{number}.png"), np.full((48, 64, 3), 40 * number, np.uint8))
+    folder = RunFolder.plan(tmp_path / "run", "walk", overwrite=False)
+    folder.create([str(tmp_path / "img_*.png")])
+    assert len(_recording(folder.path, None, None)) == 3
+    for image in tmp_path.glob("img_*.png"):
+        image.unlink()
+    with pytest.raises(InputError, match="name it by --recording"):
+        _recording(folder.path, None, None)
+
+
+@pytest.mark.parametrize("source", ["camera:7", "http://user:secret@127.0.0.1:9/video"])
+def test_a_live_source_is_not_opened_again(tmp_path: Path, source: str) -> None:
+    folder = RunFolder.plan(tmp_path / "run", "live", overwrite=False)
+    folder.create([source])
+    with pytest.raises(InputError, match="live source, whose images are not kept") as told:
+        _recording(folder.path, None, None)
+    assert "secret" not in str(told.value)
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:

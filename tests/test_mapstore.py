@@ -105,6 +105,32 @@ def test_a_damaged_description_is_refused(text: str, says: str, tmp_path: Path) 
         Map.load(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("files", {"keyframes.safetensors": "x"}),
+        ("files", {"keyframes.safetensors": {}}),
+        ("camera", []),
+        ("features", [1]),
+        ("metric", None),
+        ("scale", None),
+        ("starts", 3),
+        ("starts", [99]),
+        ("sessions", []),
+        ("shutter", {"readout_s": "x", "sigma_s": None}),
+        ("shutter", {"readout_s": 0.0, "sigma_s": "x"}),
+    ],
+)
+def test_a_value_of_another_kind_in_the_description_is_refused(
+    saved: Map, tmp_path: Path, name: str, value: object
+) -> None:
+    saved.save(tmp_path / "map")
+    about = tmp_path / "map" / "map.json"
+    about.write_text(json.dumps({**json.loads(about.read_text()), name: value}))
+    with pytest.raises(DatasetError, match=r"map\.json: is damaged"):
+        Map.load(tmp_path)
+
+
 def test_arrays_of_another_shape_or_with_ids_that_point_nowhere_are_refused(saved: Map) -> None:
     for group, name, wrong in (
         ("keyframes", "T_camera_world", np.zeros((len(saved), 3, 4))),

@@ -33,6 +33,17 @@ def test_planning_makes_nothing(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
+def test_a_run_never_removes_what_it_reads(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    RunFolder.plan(place, "desk", overwrite=False).create()
+    folder = RunFolder.plan(place, "desk", overwrite=True)
+    for inner in ("map", "maps/2/map", "export/colmap", "export/nerfstudio/transforms.json"):
+        with pytest.raises(OutputError, match="name another folder"):
+            folder.check_keeps([place / inner])
+    folder.check_keeps([place / "walk.mp4", tmp_path / "other" / "map", Path("camera:0")])
+    RunFolder.plan(tmp_path / "new", "desk", overwrite=False).check_keeps([tmp_path / "new" / "map"])
+
+
 def test_an_earlier_run_is_replaced_only_when_asked(tmp_path: Path) -> None:
     place = tmp_path / "run"
     RunFolder.plan(place, "desk", overwrite=False).create()

@@ -14,13 +14,15 @@ import pytest
 from command_line import ENVIRONMENT, call, command, leave_out_plots, make_long
 from tracking_scene import CAMERA, CONFIG, COUNT, ConstantDepth, colour_only, frames, walk
 
-from slamdepth import DepthPrediction, Frame, StoredFrame, Tracker
+from slamdepth import Config, DepthPrediction, Frame, StoredFrame, Tracker
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import OutputError
 from slamdepth.io.tensors import decode_tensors, encode_tensors
 from slamdepth.io.tree import flattened, restored
 from slamdepth.pipeline import checkpoint
+from slamdepth.pipeline.asked import begun_run
+from slamdepth.pipeline.options import RunOptions
 from slamdepth.pipeline.steps import steps_of, steps_state
 from slamdepth.types import StepResult
 
@@ -138,6 +140,30 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again(
     done = call("run", "--resume", folder)
     assert done.returncode == 0, done.stderr
     assert json.loads((folder / "report.json").read_text())["frames"] == 3 * 78
+
+
+@pytest.mark.parametrize(
+    "given", [("--max-frames", 5), ("--output", "elsewhere"), ("--no-mesh",), ("--seed", 0), ("--view",)]
+)
+def test_options_that_a_resumed_run_would_not_heed_are_refused(
+    tmp_path: Path, given: tuple[object, ...]
+) -> None:
+    done = call("run", "--resume", tmp_path, *given)
+    assert done.returncode == 2
+    assert f"the options that the run had: leave out {given[0]}" in done.stderr
+    assert "holds no run" in call("run", "--resume", tmp_path, "--quiet").stderr
+
+
+def test_a_run_goes_on_from_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "imu.csv").write_text("")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    config = Config.from_dict({"scale": {"imu": "imu.csv"}})
+    begun = begun_run(RunOptions(Path("img_*.png"), camera_file=Path("~/cam.yaml")), config, {})
+    assert begun["config"]["scale"]["imu"] == str(tmp_path / "imu.csv")
+    assert begun["options"]["sequence"] == str(tmp_path / "img_*.png")
+    assert begun["options"]["camera_file"] == str(tmp_path / "home" / "cam.yaml")
+    assert Config.from_dict(begun["config"]).scale.depth is None
 
 
 def test_what_cannot_go_on_is_said_in_one_line(room: Path, tiny_room: Path, tmp_path: Path) -> None:

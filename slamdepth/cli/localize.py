@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slamdepth.cli.console import QuietOption, VerboseOption, console, print_notes, print_places
-from slamdepth.cli.options import CameraOption, MaxFramesOption, StrideOption
+from slamdepth.cli.options import (
+    CameraOption,
+    FollowLinksOption,
+    MaxFramesOption,
+    StrideOption,
+    TopicOption,
+)
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import stop_on_signals
 
@@ -31,6 +37,8 @@ def localize_command(
     camera: CameraOption = None,
     max_frames: MaxFramesOption = None,
     stride: StrideOption = 1,
+    topic: TopicOption = None,
+    follow_links: FollowLinksOption = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace earlier results in DIR.")] = False,
     verbose: VerboseOption = False,
     quiet: QuietOption = False,
@@ -43,6 +51,7 @@ def localize_command(
 
     A frame without a place, or with two that look alike, gets no pose.
     """
+    from slamdepth.datasets import ReadOptions
     from slamdepth.mapstore import Map
     from slamdepth.pipeline.localize import localize, plan_folder
 
@@ -55,6 +64,7 @@ def localize_command(
             camera=camera,
             max_frames=max_frames,
             stride=stride,
+            reading=ReadOptions(topic, follow_links=follow_links),
             progress=lambda done, total, step: bar.show("placing", done, total, step.status.value),
             stop=stop.is_set,
         )

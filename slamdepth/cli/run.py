@@ -42,7 +42,12 @@ _PLACES = {
 }
 
 
+_WITH_RESUME = ("resume", "sequence", "verbose", "quiet")
+"""Parameters that may be given together with ``--resume``."""
+
+
 def run_command(
+    context: typer.Context,
     sequence: Annotated[
         Path | None,
         typer.Argument(
@@ -216,6 +221,7 @@ def run_command(
     Example: slamdepth run walk2.mp4 --map runs/walk
 
     Example: slamdepth run --resume runs/walk
+
     Example: slamdepth run recording.bag --topic /camera/color/image_raw
 
     Example: slamdepth run camera:0 --camera webcam.yaml --seconds 60
@@ -223,6 +229,7 @@ def run_command(
     Ctrl-C finishes the run with the frames it has; a second Ctrl-C aborts it.
     """
     if resume is not None:
+        _check_alone(context)
         _resume(resume, sequence, quiet)
         return
     if sequence is None:
@@ -279,6 +286,23 @@ def run_command(
             watcher=watcher,
         )
     _print_result(result, quiet)
+
+
+def _check_alone(context: typer.Context) -> None:
+    """Refuse options that a resumed run would not heed.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    from slamdepth.errors import ConfigError
+
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        source = context.get_parameter_source(name)
+        if name not in _WITH_RESUME and source is not None and source.name == "COMMANDLINE":
+            raise ConfigError(
+                f"--resume goes on with the options that the run had: leave out {parameter.opts[0]}"
+            )
 
 
 def _resume(folder: Path, sequence: Path | None, quiet: bool) -> None:

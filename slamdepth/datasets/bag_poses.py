@@ -53,6 +53,11 @@ class _Edge:
         return [pose if ok else None for pose, ok in zip(found, inside.tolist(), strict=True)]
 
 
+def pose_topics(bag: BagFile) -> list[str]:
+    """The topics that have poses, sorted by name."""
+    return [name for name, one in sorted(bag.topics.items()) if one.count and one.type in (*_TREE, *_POSES)]
+
+
 def poses_of_topic(
     bag: BagFile, topic: str, times_s: Floats, camera_frame: str, notes: list[str]
 ) -> Trajectory:
@@ -68,7 +73,7 @@ def poses_of_topic(
     """
     found = bag.topics.get(topic)
     if found is None or found.type not in (*_TREE, *_POSES):
-        known = [name for name, one in sorted(bag.topics.items()) if one.type in (*_TREE, *_POSES)]
+        known = pose_topics(bag)
         what = "there is no topic" if found is None else f"{found.type} is no pose:"
         raise DatasetError(f"{bag.path}: {what} {topic}; topics with poses: {', '.join(known) or 'none'}")
     if found.type in _TREE:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from slamdepth.datasets.addresses import address_of
 from slamdepth.datasets.base import Dataset, read_sound
 from slamdepth.datasets.intrinsics import Certainty
 from slamdepth.datasets.sensor_depth import check_sensor_depth
@@ -60,7 +61,7 @@ def summarise(dataset: Dataset) -> SequenceSummary:
     camera = dataset.camera
     facts = {
         "name": dataset.name,
-        "path": str(dataset.path),
+        "path": address_of(str(dataset.path)),
         "layout": dataset.layout,
         "live": dataset.is_live,
         "frames": None if dataset.is_live else len(times_s),

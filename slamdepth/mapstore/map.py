@@ -135,15 +135,21 @@ class Map:
                 continue
             if entry is None:
                 raise DatasetError(f"{folder / ABOUT}: is damaged: {file.name} is not listed")
+            digest = entry.get("sha256") if isinstance(entry, dict) else None
+            if not isinstance(digest, str):
+                raise DatasetError(f"{folder / ABOUT}: is damaged: {file.name} has no checksum")
             try:
-                groups[group], _ = decode_tensors(read_checked(file, entry["sha256"]))
+                groups[group], _ = decode_tensors(read_checked(file, digest))
             except ValueError as error:
                 raise DatasetError(f"{file}: is damaged: {error}") from error
-        check_arrays(groups, str(folder))
+        sizes = check_arrays(groups, str(folder))
         try:
-            return _map_of(about, groups)
-        except (KeyError, TypeError, ValueError, CameraError) as error:
+            saved = _map_of(about, groups)
+        except (AttributeError, KeyError, TypeError, ValueError, CameraError) as error:
             raise DatasetError(f"{folder / ABOUT}: is damaged: {error}") from error
+        if trouble := _trouble(saved, sizes["K"]):
+            raise DatasetError(f"{folder / ABOUT}: is damaged: {trouble}")
+        return saved
 
     def save(self, path: str | Path) -> None:
         """Write the map as a folder, whole or not at all; an earlier map there is replaced.
@@ -273,12 +279,25 @@ def _map_of(about: dict[str, Any], groups: Mapping[str, Arrays]) -> Map:
         Camera(**camera),
         bool(about["is_measured"]),
         tuple(Session(**session) for session in about["sessions"]),
-        about["features"],
-        about["metric"],
+        dict(about["features"]),
+        dict(about["metric"]),
         str(about["vocabulary_sha256"]),
-        (float(shutter["readout_s"]), shutter["sigma_s"]),
-        about["scale"],
+        (float(shutter["readout_s"]), None if shutter["sigma_s"] is None else float(shutter["sigma_s"])),
+        dict(about["scale"]),
         tuple(int(k) for k in about["starts"]),
         int(about["loop_closures"]),
         groups,
     )
+
+
+def _trouble(saved: Map, keyframes: int) -> str:
+    """What is wrong with the numbers of ``map.json``; empty where nothing is."""
+    if not all(0 <= start < keyframes for start in saved.starts):
+        return "starts points nowhere"
+    for group in ("keyframes", "frames"):
+        session = saved.groups[group]["session"]
+        if session.size and (session.min() < 0 or session.max() >= len(saved.sessions)):
+            return f"{file_of(group)} has a recording that sessions does not list"
+    if any(value is not None and np.isnan(value) for value in saved.shutter):
+        return "shutter is no time"
+    return ""

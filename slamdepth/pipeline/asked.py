@@ -65,14 +65,17 @@ def settings_text(options: RunOptions, config: Config) -> str:
 
 
 def begun_run(options: RunOptions, config: Config, about: dict[str, Any]) -> dict[str, Any]:
-    """What it takes to do a run again."""
+    """What it takes to do a run again, from whatever folder."""
     asked = asdict(options)
     paths = ("sequence", "camera_file", "start_map")
     return {
         "options": {
             **{name: value for name, value in asked.items() if name not in (*paths, "output", "overwrite")},
-            **{name: None if asked[name] is None else str(Path(asked[name]).absolute()) for name in paths},
+            **{
+                name: None if asked[name] is None else str(Path(asked[name]).expanduser().absolute())
+                for name in paths
+            },
         },
-        "config": config.model_dump(mode="json"),
+        "config": config.to_dict(),
         "sequence": about,
     }

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from slamdepth.datasets import Dataset, ReadOptions, open_dataset
+from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.intrinsics import Certainty
+from slamdepth.datasets.readers.live import LiveReader
 from slamdepth.depth.gravity_consensus import GravityConsensus
-from slamdepth.errors import ConfigError, InputError, SlamdepthError
+from slamdepth.errors import ConfigError, DatasetError, InputError, SlamdepthError
 from slamdepth.export import (
     FORMATS,
     ExportRequest,
@@ -254,6 +256,15 @@ def _recording(folder: Path, recording: str | Path | None, camera: str | Path | 
     path = Path(recording) if recording is not None else Path(arguments[0]) if arguments else None
     if path is None:
         raise InputError(f"{folder}: does not say what was run: name it by --recording")
-    if recording is None and not path.exists():
-        raise InputError(f"{path}: the recording of this run is not there any more: name it by --recording")
-    return open_dataset(path, camera, reading)
+    if LiveReader().matches(path):
+        raise InputError(
+            f"{without_secret(str(path))}: is a live source, whose images are not kept: use --images none"
+        )
+    try:
+        return open_dataset(path, camera, reading)
+    except DatasetError as error:
+        if recording is not None or path.exists():
+            raise
+        raise InputError(
+            f"{path}: the recording of this run is not there any more: name it by --recording"
+        ) from error

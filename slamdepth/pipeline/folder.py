@@ -8,7 +8,7 @@ import logging.handlers
 import shlex
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,6 +104,23 @@ class RunFolder:
         if not overwrite:
             raise OutputError(f"{path}: holds an earlier run; name another folder or add --overwrite")
         return cls(writable(path), replaces=True)
+
+    def check_keeps(self, paths: Iterable[Path]) -> None:
+        """Refuse to replace an earlier run whose map or export this run reads.
+
+        Raises:
+            OutputError: one of ``paths`` lies in what :meth:`create` removes.
+        """
+        if not self.replaces:
+            return
+        removed = [(self.path / name).resolve() for name in (MAP, MAPS, EXPORTS)]
+        for path in paths:
+            place = path.expanduser().resolve()
+            if any(place.is_relative_to(folder) for folder in removed):
+                raise OutputError(
+                    f"{self.path}: this run reads {path}, which would be removed with the run there; name "
+                    "another folder"
+                )
 
     def create(self, arguments: Sequence[str] = ()) -> None:
         """Make the folder, without the files of an earlier run, and its README.

@@ -14,6 +14,7 @@ from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.depth.metric import configured_model, with_chosen_model
 from slamdepth.errors import DatasetError
 from slamdepth.mapstore import Map
+from slamdepth.mapstore.map import map_folder
 from slamdepth.pipeline.camera import OpeningCamera, settle_camera, use_view
 from slamdepth.pipeline.checkpoint import Latest, SequenceKeyframes
 from slamdepth.pipeline.export import check_exports
@@ -107,6 +108,9 @@ def prepare(
         )
     is_new = begun is None
     folder = RunFolder.plan(options.output, dataset.name, overwrite=options.overwrite or not is_new)
+    if is_new:
+        needed = [] if options.start_map is None else [map_folder(options.start_map)]
+        folder.check_keeps([options.sequence, *needed])
     seed_everything(config.seed)
     given = configured_model(config)
     if is_sensor(given):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -15,8 +16,10 @@ from numpy.typing import NDArray
 
 from slamdepth._version import __version__
 from slamdepth.config import Config
-from slamdepth.datasets import open_dataset
+from slamdepth.datasets import ReadOptions, open_dataset
+from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.image_files import IMAGE_ENDINGS
+from slamdepth.datasets.readers.live import LiveReader
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError, OutputError
 from slamdepth.io import write_json, write_text, write_tum_trajectory
 from slamdepth.io.images import read_image_rgb
@@ -98,6 +101,7 @@ def localize(
     config: Config | None = None,
     max_frames: int | None = None,
     stride: int = 1,
+    reading: ReadOptions | None = None,
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Localisation:
@@ -110,6 +114,7 @@ def localize(
         config: settings; features are those of the map.
         max_frames: stop after this many frames. Default: all.
         stride: take every Nth frame.
+        reading: how the source is opened, such as the topic of a bag.
         progress: called with frames done, frames in all, and the last result.
         stop: asked before each frame; True ends with the frames placed so far.
 
@@ -122,7 +127,12 @@ def localize(
     tell = progress or (lambda done, total, result: None)
     if path.is_file() and path.suffix.lower() in IMAGE_ENDINGS:
         return _localize_image(saved, path, camera, config)
-    dataset = open_dataset(path, camera)
+    if LiveReader().matches(path):
+        raise DatasetError(
+            f"{without_secret(str(path))}: is a live source; only recordings are placed in a map: record it "
+            "first, or track it with 'slamdepth run --map'"
+        )
+    dataset = open_dataset(path, camera, reading)
     indices = range(0, len(dataset), stride)[:max_frames]
     used = camera_for(dataset, saved)
     notes = list(dataset.notes)
@@ -246,7 +256,8 @@ def plan_folder(output: Path | None, name: str, *, overwrite: bool) -> Path:
     from slamdepth.io import writable
 
     if output is None:
-        return writable(Path("runs") / f"{name}-localized-{time.strftime('%Y%m%d-%H%M%S')}")
+        safe = re.sub(r"[^\w.-]+", "-", name)  # a pattern has stars
+        return writable(Path("runs") / f"{safe}-localized-{time.strftime('%Y%m%d-%H%M%S')}")
     path = output.expanduser()
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path}: is a file; name a folder for the results")

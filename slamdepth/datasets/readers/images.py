@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 PAIRS_FILE = "camera.json"
 """Marks a folder of training pairs, half of whose images are depth."""
 
+_RUN_FILES = ("report.json", "trajectory_online.txt", "config.yaml")
+"""Mark a run folder, whose only image is one of the mesh."""
+
 
 @register_last_reader
 class ImagesReader:
@@ -37,6 +40,11 @@ class ImagesReader:
         return has_images(path) and not (path / PAIRS_FILE).exists()
 
     def open(self, path: Path, camera: Camera | None) -> FolderSequence:
+        if all((path / name).is_file() for name in _RUN_FILES):
+            raise DatasetError(
+                f"{path}: is the folder of a run, not a recording: name what was run, or see the result with "
+                "'slamdepth view'"
+            )
         return self.open_list(path, tuple(list_images(path)), camera)
 
     def open_list(self, path: Path, images: tuple[Path, ...], camera: Camera | None) -> FolderSequence:

@@ -24,7 +24,7 @@ from slamdepth.datasets.bag_images import (
     is_colour,
     is_depth,
 )
-from slamdepth.datasets.bag_poses import poses_of_topic
+from slamdepth.datasets.bag_poses import pose_topics, poses_of_topic
 from slamdepth.datasets.options import ReadOptions
 from slamdepth.datasets.recording import Recording, camera_for, recorded_camera
 from slamdepth.datasets.registry import register_reader
@@ -88,6 +88,8 @@ class RosbagReader:
         truth = None
         if options.pose_topic is not None:
             truth = poses_of_topic(bag, options.pose_topic, index.times_s, view.frame, notes)
+        elif known := pose_topics(bag):
+            notes.append(f"topics with poses, not used: {', '.join(known)}; --pose-topic takes one as truth")
         depth = _depth_of(bag, views, view, index, taken_by, options.depth_topic, notes)
         images = _Images(bag.reader_of(view.topic, index), view.topic)
         return Recording(

@@ -30,7 +30,7 @@ class Recording:
 
 
 def find_recordings(inputs: Sequence[str]) -> tuple[Recording, ...]:
-    """The recordings that the arguments of a batch name, each once, in order.
+    """The recordings that the arguments of a batch name, each once with the same options, in order.
 
     Args:
         inputs: paths; patterns with ``*``, ``?`` or ``[...]``, whose matches are sorted; and ``.txt`` files
@@ -52,11 +52,9 @@ def find_recordings(inputs: Sequence[str]) -> tuple[Recording, ...]:
             found += [Recording(match) for match in matches]
         else:
             found.append(Recording(text if _is_address(text) else str(path)))
-    unique = {one.path: one for one in reversed(found)}
-    kept = [one for one in found if unique.get(one.path) is one]
-    if not kept:
+    if not found:
         raise DatasetError("no recordings: name videos, folders, patterns, or a .txt list of them")
-    return tuple(kept)
+    return tuple(dict.fromkeys(found))
 
 
 def _is_address(text: str) -> bool:

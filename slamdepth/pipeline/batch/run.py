@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from slamdepth.datasets.addresses import without_secret
 from slamdepth.errors import ConfigError, OutputError
 from slamdepth.io import write_json
 from slamdepth.pipeline.batch.cluster import check_ray, run_on_cluster
@@ -103,7 +104,7 @@ class _Batch:
     ) -> None:
         self._folder, self._progress = folder, progress
         self._lock = threading.Lock()
-        names = _names(recordings, before)
+        names = _names(recordings, options, before, folder)
         self._jobs = [
             _job(name, (one.path, *options, *one.options), folder.absolute(), before.get(name, {}))
             for name, one in zip(names, recordings, strict=True)
@@ -114,7 +115,7 @@ class _Batch:
     @staticmethod
     def _known(job: Job, before: dict[str, dict[str, Any]]) -> Outcome:
         entry = before.get(job.name, {})
-        same = tuple(entry.get("arguments", ())) == job.arguments
+        same = tuple(entry.get("arguments", ())) == _shown(job.arguments)
         if same and entry.get("state") == State.DONE.value and is_finished(job.folder):
             return Outcome(State.DONE, wall_s=entry.get("wall_s"))
         return Outcome(State.WAITING)
@@ -156,7 +157,7 @@ class _Batch:
             "name": job.name,
             "state": outcome.state.value,
             "error": outcome.error or None,
-            "arguments": list(job.arguments),
+            "arguments": list(_shown(job.arguments)),
             "wall_s": outcome.wall_s,
             **batch_row(report),
         }
@@ -164,7 +165,7 @@ class _Batch:
 
 def _job(name: str, arguments: tuple[str, ...], output: Path, entry: dict[str, Any]) -> Job:
     """A job; it goes on with what a stopped or killed batch left, not with what failed."""
-    is_same = tuple(entry.get("arguments", ())) == arguments
+    is_same = tuple(entry.get("arguments", ())) == _shown(arguments)
     return Job(name, arguments, output, is_same and entry.get("state") != State.FAILED.value)
 
 
@@ -183,29 +184,51 @@ def _earlier(folder: Path) -> dict[str, dict[str, Any]]:
         runs = json.loads(path.read_text(encoding="utf-8"))["runs"]
         return {str(run["name"]): dict(run) for run in runs}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise OutputError(f"{path}: is damaged ({error}); remove it to do all runs again") from error
+        raise OutputError(
+            f"{path}: is damaged ({error}); name a new folder, the runs in this one stay"
+        ) from error
 
 
-def _names(recordings: Sequence[Recording], before: dict[str, dict[str, Any]]) -> list[str]:
-    """A folder name for each recording: the one it had before, else its own, made unique."""
-    had = {str(entry["arguments"][0]): name for name, entry in before.items() if entry.get("arguments")}
-    taken = {had[one.path] for one in recordings if one.path in had}
-    names = []
-    for one in recordings:
-        name = had.get(one.path)
-        if name is None:
-            stem = _stem(one.path)
-            name, number = stem, 2
-            while name in taken:
-                name, number = f"{stem}-{number}", number + 1
+def _names(
+    recordings: Sequence[Recording], options: tuple[str, ...], before: dict[str, dict[str, Any]], folder: Path
+) -> list[str]:
+    """A folder name for each recording: the one it had before, else its own, made unique.
+
+    A folder that another recording had, now or earlier, is never given away.
+    """
+    had: dict[tuple[str, ...], list[str]] = {}
+    for name, entry in before.items():
+        arguments = tuple(map(str, entry.get("arguments", ())))
+        for key in (arguments, arguments[:1]):
+            had.setdefault(key, []).append(name)
+    names: dict[int, str] = {}
+    for is_exact in (True, False):  # with the same options first, then with others
+        for number, one in enumerate(recordings):
+            key = _shown((one.path, *options, *one.options) if is_exact else (one.path,))
+            free = [name for name in had.get(key, ()) if name not in names.values()]
+            if number not in names and free:
+                names[number] = free[0]
+    taken = {*before, *names.values()}
+    for number, one in enumerate(recordings):
+        if number in names:
+            continue
+        stem = _stem(one.path)
+        name, count = stem, 2
+        while name in taken or (folder / name).exists():
+            name, count = f"{stem}-{count}", count + 1
+        names[number] = name
         taken.add(name)
-        names.append(name)
-    return names
+    return [names[number] for number in range(len(recordings))]
+
+
+def _shown(arguments: tuple[str, ...]) -> tuple[str, ...]:
+    """Arguments as ``batch.json`` has them: without what is secret in the address of a live source."""
+    return (without_secret(arguments[0]), *arguments[1:])
 
 
 def _stem(path: str) -> str:
     """A folder name for a recording."""
-    place = Path(path)
+    place = Path(without_secret(path))
     stem = place.name if place.is_dir() else place.stem
     stem = stem or place.resolve().name
     safe = "".join(c if c.isalnum() or c in "._-" else "-" for c in stem).strip(".-")
