@@ -264,6 +264,7 @@ def test_bad_input_is_one_line(result: RunResult, arguments: list[str], says: st
         ("map/map.json", b"{}", "colmap", "is no map of slamdepth"),
         ("map/keyframes.safetensors", b"x", "nerfstudio", "keyframes.safetensors"),
         ("README.txt", b"A run of slamdepth", "colmap", "name it by --recording"),
+        ("README.txt", b"A run of slamdepth\n  slamdepth run gone.mp4", "colmap", "the run was started in"),
     ],
 )
 def test_a_damaged_run_is_one_line(

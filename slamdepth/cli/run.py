@@ -216,6 +216,7 @@ def run_command(
     Example: slamdepth run walk2.mp4 --map runs/walk
 
     Example: slamdepth run --resume runs/walk
+
     Example: slamdepth run recording.bag --topic /camera/color/image_raw
 
     Example: slamdepth run camera:0 --camera webcam.yaml --seconds 60

@@ -265,7 +265,10 @@ def _recording(folder: Path, recording: str | Path | None, camera: str | Path | 
     if path is None:
         raise InputError(f"{folder}: does not say what was run: name it by --recording")
     if recording is None and not path.exists():
-        raise InputError(f"{path}: the recording of this run is not there any more: name it by --recording")
+        raise InputError(
+            f"{path}: the recording of this run is not there: start in the folder that the run was started "
+            "in, or name it by --recording"
+        )
     dataset = open_dataset(path, camera, reading)
     if camera is None and "--fov" in given:
         use_view(dataset, float(given["--fov"]))
