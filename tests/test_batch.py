@@ -17,10 +17,12 @@ import pytest
 from command_line import ENVIRONMENT, call, command, make_long, slamdepth
 
 from slamdepth.errors import ConfigError, DatasetError, OutputError
+from slamdepth.pipeline.asked import arguments_of
 from slamdepth.pipeline.batch import BatchProgress, Recording, find_recordings, run_batch
 from slamdepth.pipeline.batch.job import Job, State, failure, share_cores
 from slamdepth.pipeline.batch.run import _job
 from slamdepth.pipeline.checkpoint import begin
+from slamdepth.pipeline.options import RunOptions
 
 PATIENCE_S = 300.0
 QUICK = "--depth sensor --no-mesh --max-frames 4"
@@ -112,6 +114,12 @@ def test_a_half_run_goes_on_and_a_failed_one_does_not(tmp_path: Path) -> None:
     assert command_of("waiting")[-3:] == command_of("stopped")[-3:] == goes_on
     assert "--overwrite" in command_of("failed")
     assert "--overwrite" in command_of("stopped", ("one", "--seed", "2"))
+
+
+def test_a_recording_whose_name_begins_with_a_dash_is_no_option(tmp_path: Path) -> None:
+    command = _job("one", ("-one.mp4", "--seed", "2"), tmp_path, {}).command()
+    assert command[-7:-2] == ["run", "./-one.mp4", "--seed", "2", "--output"]
+    assert arguments_of(RunOptions(Path("-one.mp4")))[0] == "./-one.mp4"
 
 
 @pytest.mark.usefixtures("pretend")

@@ -105,6 +105,20 @@ def test_one_image_is_placed_with_the_camera_of_the_map(
     assert len(read_tum_trajectory(tmp_path / "one" / "trajectory.txt")[0]) == 1
 
 
+def test_one_image_of_a_wide_lens_is_placed(run_folder: Path, tiny_room: Path, tmp_path: Path) -> None:
+    own = Map.load(run_folder).camera
+    lens = tmp_path / "lens.yaml"
+    lens.write_text(  # without alpha the model is a pinhole
+        f"model: extended_unified\nwidth: {own.width}\nheight: {own.height}\nfx: {own.fx}\nfy: {own.fy}\n"
+        f"cx: {own.cx}\ncy: {own.cy}\ndistortion: [0.0, 1.0]\n"
+    )
+    out = tmp_path / "one"
+    done = call("localize", "--map", run_folder, images(tiny_room)[12], "--camera", lens, "-o", out)
+    assert done.returncode == 0, done.stderr
+    found, expected = (read_tum_trajectory(place / "trajectory.txt")[0] for place in (out, run_folder))
+    assert found.T_world_camera[0] == pytest.approx(expected.T_world_camera[12], abs=0.02)
+
+
 def test_a_run_goes_on_from_the_map(
     run_folder: Path, tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

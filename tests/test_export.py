@@ -25,10 +25,10 @@ from slamdepth.export.images import ExportImages
 from slamdepth.export.tracks import MAX_ERROR_PX, build_tracks
 from slamdepth.export.upright import y_up, z_up
 from slamdepth.geometry import invert, se3_exp
-from slamdepth.io import read_tum_trajectory
+from slamdepth.io import read_tum_trajectory, write_camera
 from slamdepth.open3d_loader import import_open3d
 from slamdepth.pipeline import RunResult
-from slamdepth.pipeline.export import _recording
+from slamdepth.pipeline.export import _recording, export_results
 from slamdepth.pipeline.folder import RunFolder, recorded_arguments
 from slamdepth.types import Camera, Frame, Trajectory
 
@@ -193,6 +193,46 @@ def test_the_saved_map_exports_as_the_run_did(result: RunResult, tmp_path: Path)
     assert text == (result.folder / "export" / "colmap" / "README.txt").read_text()
 
 
+def test_poses_are_exported_with_the_camera_that_they_were_tracked_with(
+    result: RunResult, tmp_path: Path, tiny_room: Path
+) -> None:
+    room = tmp_path / "room"
+    shutil.copytree(tiny_room, room)
+    tracked = result.reconstruction.keyframes[0].frame.camera
+    write_camera(room / "camera.yaml", replace(tracked, fx=1.2 * tracked.fx, fy=1.2 * tracked.fy))
+    by_run, by_user = (
+        json.loads((folder / "transforms.json").read_text())["fl_x"]
+        for folder in (
+            package.export_run(
+                result.folder, "nerfstudio", tmp_path / name, images="raw", recording=room, camera=camera
+            )
+            for name, camera in (("by_run", None), ("by_user", room / "camera.yaml"))
+        )
+    )
+    assert by_run == pytest.approx(tracked.fx)
+    assert by_user == pytest.approx(1.2 * tracked.fx)
+
+
+def test_a_run_that_added_no_keyframe_to_its_map_is_exported(
+    result: RunResult, tmp_path: Path, tiny_room: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(result.folder, run, ignore=shutil.ignore_patterns("export", "map"))
+    (run / "keyframes.txt").write_text("# timestamp tx ty tz qx qy qz qw\n")
+    poses, _ = read_tum_trajectory(package.export_run(run, "tum") / "trajectory.txt")
+    assert len(poses) == len(result.trajectory)
+    with pytest.raises(InputError, match=r"no keyframe to export.*--every-frame"):
+        package.export_run(run, "nerfstudio")
+    folder = package.export_run(run, "nerfstudio", every_frame=True)
+    assert len(json.loads((folder / "transforms.json").read_text())["frames"]) == len(result.trajectory)
+    bare = replace(result.reconstruction, keyframes=())
+    notes = export_results(
+        RunFolder(run), open_dataset(tiny_room), [bare], [""], ["kitti", "colmap"], lambda state: None
+    )
+    assert len(notes) == 1
+    assert "no keyframe to export" in notes[0]
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -224,6 +264,7 @@ def test_bad_input_is_one_line(result: RunResult, arguments: list[str], says: st
         ("map/map.json", b"{}", "colmap", "is no map of slamdepth"),
         ("map/keyframes.safetensors", b"x", "nerfstudio", "keyframes.safetensors"),
         ("README.txt", b"A run of slamdepth", "colmap", "name it by --recording"),
+        ("README.txt", b"A run of slamdepth\n  slamdepth run gone.mp4", "colmap", "the run was started in"),
     ],
 )
 def test_a_damaged_run_is_one_line(

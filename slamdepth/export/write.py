@@ -9,7 +9,7 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from slamdepth.errors import OutputError
+from slamdepth.errors import InputError, OutputError
 from slamdepth.export.images import ImageMode
 from slamdepth.export.registry import ExportRequest, export_format
 from slamdepth.io import writable, write_text
@@ -33,6 +33,11 @@ def write_export(request: ExportRequest, name: str, folder: Path, *, overwrite: 
         OutputError: the folder holds something else, or cannot be written.
     """
     kind = export_format(name)
+    if kind.has_images and not request.scene.views:
+        raise InputError(
+            "this run has no keyframe to export, since the map that it went on from had all it needed: "
+            "'slamdepth export RUN --every-frame' takes its frames"
+        )
     folder = check_place(folder, overwrite=overwrite)
     folder = folder.absolute()
     partial = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.partial")

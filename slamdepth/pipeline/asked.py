@@ -10,6 +10,7 @@ from typing import Any
 from slamdepth.config import Config
 from slamdepth.datasets import ReadOptions
 from slamdepth.datasets.addresses import without_secret
+from slamdepth.pipeline.folder import as_argument
 from slamdepth.pipeline.options import (
     RunOptions,
 )
@@ -34,7 +35,7 @@ def reported_options(options: RunOptions, tracked: Tracked) -> dict[str, object]
 
 def arguments_of(options: RunOptions) -> list[str]:
     """What the command line was given, without the settings and the run folder."""
-    arguments = [without_secret(str(options.sequence))]
+    arguments = [as_argument(without_secret(str(options.sequence)))]
     if options.camera_file is not None:
         arguments += ["--camera", str(options.camera_file)]
     if options.view_deg is not None:

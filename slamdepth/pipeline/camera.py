@@ -15,6 +15,8 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from slamdepth.backend.self_calibration import Prior, SelfCalibration, self_calibrate
 from slamdepth.backend.sights import Sights
 from slamdepth.config import Config
@@ -54,11 +56,14 @@ class OpeningCamera:
         source: where the first guess comes from.
         prior: what is known without the motion; None where the camera is not looked for.
         sigma_log_f: deviation of the logarithm of the focal length; None where the camera was given.
+        scatter: deviation of log f between the windows where it did not settle, else 0: a map agrees with the
+            camera it was tracked with, and cannot tell it.
     """
 
     source: CameraSource
     prior: Prior | None = None
     sigma_log_f: float | None = None
+    scatter: float = 0.0
 
 
 def use_view(dataset: Dataset, view_deg: float) -> None:
@@ -100,6 +105,8 @@ def settle_camera(
         return OpeningCamera(source, None, sigma)
     passes: list[tuple[float, Sights]] = []
     settled: tuple[SelfCalibration, float] | None = None
+    scatter = 0.0
+    found_log_f: list[float] = []
     for n, place in enumerate(_PLACES):
         start = round(place * max(0, len(indices) - WINDOW))
         window = indices[start : start + WINDOW]
@@ -117,11 +124,14 @@ def settle_camera(
         )  # fmt: skip
         settled = (found, math.hypot(found.sigma_log_f, change, _MODEL_SIGMA))
         dataset.camera = found.camera
+        found_log_f.append(math.log(found.camera.fx))
         has_settled = change < max(_SETTLED, found.sigma_log_f) and found.sigma_log_f < _SURE
         if n + 1 >= _FEWEST_PASSES and has_settled:
+            scatter = 0.0
             break
-    if settled is not None and _is_observed(settled[1], prior):
-        return OpeningCamera(source, prior, settled[1])
+        scatter = float(np.std(found_log_f))
+    if settled is not None and _is_observed(opening := math.hypot(settled[1], scatter), prior):
+        return OpeningCamera(source, prior, opening, scatter)
     logger.warning("the motion of the first windows does not show the focal length")
     dataset.camera = guess
     return OpeningCamera(source, prior, sigma)
@@ -141,7 +151,7 @@ def check_camera(dataset: Dataset, opening: OpeningCamera, tracker: object) -> C
         return CameraFacts(camera, opening.source, sigma_log_f=opening.sigma_log_f)
     found = self_calibrate(sights, camera, opening.prior)
     change = math.log(found.camera.fx / camera.fx)
-    sigma = math.hypot(found.sigma_log_f, change, _MODEL_SIGMA)
+    sigma = math.hypot(found.sigma_log_f, change, _MODEL_SIGMA, opening.scatter)
     is_observed = _is_observed(sigma, opening.prior)
     logger.info(
         "final map: focal length %.1f px +- %.1f %%, tracked with %.1f px",

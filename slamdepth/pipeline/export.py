@@ -15,7 +15,6 @@ import numpy as np
 
 from slamdepth.datasets import Dataset, ReadOptions, open_dataset
 from slamdepth.datasets.addresses import without_secret
-from slamdepth.datasets.intrinsics import Certainty
 from slamdepth.datasets.readers.live import LiveReader
 from slamdepth.depth.gravity_consensus import GravityConsensus
 from slamdepth.errors import ConfigError, DatasetError, InputError, SlamdepthError
@@ -31,11 +30,14 @@ from slamdepth.export import (
 from slamdepth.export.registry import Progress
 from slamdepth.export.write import check_place
 from slamdepth.io import read_tum_trajectory
+from slamdepth.io.text import read_commented_lines
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapstore import Map
 from slamdepth.mapstore.map import is_map
+from slamdepth.pipeline.camera import use_view
 from slamdepth.pipeline.folder import EXPORTS, MAP, MAPS, RunFolder, is_run, recorded_arguments
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
+from slamdepth.types import Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -64,7 +66,7 @@ def export_run(
         every_frame: export the image of every frame that has a pose, not of keyframes alone.
         map_number: which map of the run, 1 for the largest.
         recording: what was run. Default: as the run's ``README.txt`` says.
-        camera: a ``camera.yaml`` of the recording. Default: as the run was given.
+        camera: a ``camera.yaml`` of the recording. Default: the camera that the run tracked with.
         overwrite: an earlier export in ``output`` may be replaced.
         progress: called with (images done, images in all).
 
@@ -86,8 +88,8 @@ def export_run(
     dataset = None
     if kind.has_images and (mode is not ImageMode.NONE or scene.camera is None):
         dataset = _recording(folder, recording, camera)
-        if scene.camera is not None and dataset.camera_source.certainty is not Certainty.GIVEN:
-            dataset.camera = scene.camera  # the run found it from the motion
+        if scene.camera is not None and camera is None:
+            dataset.camera = scene.camera  # the poses belong to it, whatever camera the recording has by now
     if every_frame:
         scene = scene.with_all_frames()
     request = ExportRequest(scene, dataset, mode, progress or (lambda done, total: None))
@@ -124,6 +126,7 @@ def export_results(
         scene = ExportScene.of(
             one, dataset.name, mesh=place / "mesh.ply", cloud=place / "cloud.ply", scale=scale
         )
+        scene = replace(scene, camera=dataset.camera)  # no keyframe has it where the run added none to a map
         request = ExportRequest(
             scene, dataset, tell=lambda done, total: tell(RunProgress(RunStage.EXPORTING, done, total))
         )
@@ -175,7 +178,7 @@ def scene_of_folder(folder: Path, map_number: int = 1, *, with_tracks: bool = Tr
         raise InputError(f"{folder}: has no map {map_number}")
     report = _report(folder)
     trajectory, _ = read_tum_trajectory(place / "trajectory.txt")
-    keyframes, _ = read_tum_trajectory(place / "keyframes.txt")
+    keyframes = _keyframes(place / "keyframes.txt")
     maps = report.get("maps") or [{}]
     scale = (maps[map_number - 1] if map_number <= len(maps) else {}).get("scale") or {}
     readout_ms = (report.get("rolling_shutter") or {}).get("readout_ms")
@@ -231,6 +234,13 @@ def with_saved_map(scene: ExportScene, saved: Map) -> ExportScene:
     )
 
 
+def _keyframes(path: Path) -> Trajectory:
+    """The keyframes of a run; none where it went on from a map that had all it needed."""
+    if all(line.startswith("#") for _, line in read_commented_lines(path)):
+        return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    return read_tum_trajectory(path)[0]
+
+
 def _report(folder: Path) -> dict[str, Any]:
     path = folder / "report.json"
     try:
@@ -261,10 +271,14 @@ def _recording(folder: Path, recording: str | Path | None, camera: str | Path | 
             f"{without_secret(str(path))}: is a live source, whose images are not kept: use --images none"
         )
     try:
-        return open_dataset(path, camera, reading)
+        dataset = open_dataset(path, camera, reading)
     except DatasetError as error:
         if recording is not None or path.exists():
             raise
         raise InputError(
-            f"{path}: the recording of this run is not there any more: name it by --recording"
+            f"{path}: the recording of this run is not there: start in the folder that the run was started "
+            "in, or name it by --recording"
         ) from error
+    if camera is None and "--fov" in given:
+        use_view(dataset, float(given["--fov"]))
+    return dataset

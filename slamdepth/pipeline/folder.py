@@ -237,6 +237,11 @@ def is_run(path: Path) -> bool:
         return False
 
 
+def as_argument(path: str) -> str:
+    """A path as an argument of a command: one that begins with a dash would be an option."""
+    return f"./{path}" if path.startswith("-") else path
+
+
 def recorded_arguments(path: Path) -> list[str]:
     """The arguments of the command that made a run, the sequence first; none where its README has no command.
 

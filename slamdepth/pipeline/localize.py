@@ -20,6 +20,7 @@ from slamdepth.datasets import ReadOptions, open_dataset
 from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.image_files import IMAGE_ENDINGS
 from slamdepth.datasets.readers.live import LiveReader
+from slamdepth.datasets.virtual_view import as_pinhole
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError, OutputError
 from slamdepth.io import write_json, write_text, write_tum_trajectory
 from slamdepth.io.images import read_image_rgb
@@ -215,6 +216,9 @@ def _localize_image(
         raise CameraError(
             f"{path}: is {width}x{height}, and the camera file is for {camera.width}x{camera.height}"
         )
+    view = as_pinhole(Frame(0, 0.0, image_rgb, camera))
+    image_rgb, camera = view.image_rgb, view.camera
+    height, width = image_rgb.shape[:2]
     if width > saved.camera.width:
         import cv2
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from slamdepth.errors import DatasetError
 from slamdepth.pipeline.checkpoint import read_begun
+from slamdepth.pipeline.folder import as_argument
 
 LOGS = "logs"
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -76,7 +77,8 @@ class Job:
         if self.may_go_on and _is_half(self.folder):
             given = ["run", "--resume", str(self.folder)]
         else:
-            given = ["run", *self.arguments, "--output", str(self.folder), "--overwrite"]
+            recording, *options = self.arguments
+            given = ["run", as_argument(recording), *options, "--output", str(self.folder), "--overwrite"]
         return [sys.executable, "-c", _WITH_PARENT, *given]
 
 
