@@ -339,6 +339,27 @@ def test_a_camera_file_overrules_every_layout(tmp_path: Path, layout: str) -> No
 
 
 @pytest.mark.parametrize(
+    ("layout", "file", "text"),
+    [
+        ("euroc", "mav0/cam0/sensor.yaml", "intrinsics: [20, 21, 7.5, 5.5]\nresolution: [99, 12]\n"),
+        ("replica", "../cam_params.json", "{}"),
+        ("scannet", "intrinsic/intrinsic_color.txt", "0 0 0 0\n" * 4),
+        ("stray", "camera_matrix.csv", "0 0 0\n" * 3),
+    ],
+)
+def test_a_camera_file_takes_the_place_of_intrinsics_that_cannot_be_used(
+    tmp_path: Path, layout: str, file: str, text: str
+) -> None:
+    folder = LAYOUTS[layout](tmp_path / "recording")
+    size = (open_dataset(folder).camera.width, open_dataset(folder).camera.height)
+    (folder / file).write_text(text)
+    with pytest.raises(CameraError):
+        open_dataset(folder)
+    write_camera(tmp_path / "mine.yaml", CAMERA.scaled(*size))
+    assert open_dataset(folder, tmp_path / "mine.yaml").camera_source.how == "--camera"
+
+
+@pytest.mark.parametrize(
     ("layout", "file", "text", "message"),
     [
         ("euroc", "mav0/cam0/data.csv", "12,a.png\n11,b.png\n", "data.csv:2: time 11 does not come after 12"),

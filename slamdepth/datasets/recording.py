@@ -209,14 +209,20 @@ def resized_depth(depth_m: Floats32, camera: Camera, what: str) -> Floats32:
 
 
 def camera_for(
-    path: Path, shape: tuple[int, ...], given: Camera | None, found: Camera | None, how: str
+    path: Path,
+    shape: tuple[int, ...],
+    given: Camera | None,
+    find: Callable[[], Camera | None] | None,
+    how: str,
 ) -> tuple[Camera, CameraSource]:
     """The camera of images of ``shape`` (H, W, ...), and where it comes from.
 
     That is the one that was given, else that of the recording, else a guess.
 
     Args:
-        how: where ``found`` was, as a user should read it.
+        find: gives the recording's camera, None where it names none; asked only where none was given, since
+            a user gives one because the recording's cannot be used. None: no recording names one.
+        how: where ``find`` has it from, as a user should read it.
 
     Raises:
         CameraError: it is of another size.
@@ -224,6 +230,7 @@ def camera_for(
     if given is not None:
         check_size(path, shape, given)
         return given, CameraSource(Certainty.GIVEN, "--camera")
+    found = None if find is None else find()
     if found is not None:
         check_size(path, shape, found)
         return found, CameraSource(Certainty.GIVEN, how)

@@ -54,11 +54,12 @@ class ColmapReader:
             notes.append(f"{len(kept) - len(names)} of {len(kept)} registered images do not exist")
         paths = [places[name] for name in names]
         _, shape = first_image(tuple(paths))
-        found = None
-        if camera is None:
-            found = recorded_camera(folder, cameras[camera_id].calibration(folder), shape, notes)
         taken_by, source = camera_for(
-            path, shape, camera, found, f"COLMAP's model in {folder.relative_to(path)}"
+            path,
+            shape,
+            camera,
+            lambda: recorded_camera(folder, cameras[camera_id].calibration(folder), shape, notes),
+            f"COLMAP's model in {folder.relative_to(path)}",
         )
         times_s = counted_times(len(paths), _FPS, notes)
         poses = {image.name: image.T_world_camera for image in kept}

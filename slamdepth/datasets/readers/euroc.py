@@ -8,7 +8,7 @@ Ground truth is of the body (the inertial sensor) and becomes that of the camera
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +49,9 @@ class EurocReader:
         notes: list[str] = []
         timestamps_s, images = _list(root / _CAMERA)
         _, shape = first_image(tuple(images))
-        found = _found(root, whole, shape, notes)
-        taken_by, source = camera_for(path, shape, camera, found.camera, found.how)
-        truth = _truth(root, whole, timestamps_s, found, notes)
+        sensor = _sensor(root, whole)
+        taken_by, source = camera_for(path, shape, camera, lambda: sensor.camera(shape, notes), sensor.how)
+        truth = _truth(root, whole, timestamps_s, sensor.T_body_camera, notes)
         recording = FileRecording(
             whole.resolve().name,
             path,
@@ -68,12 +68,17 @@ class EurocReader:
 
 
 @dataclass(frozen=True)
-class _Found:
-    """The camera, where it was, and its pose on the body, each None where it is not known."""
+class _Sensor:
+    """What a file says of the camera, where it says so, and the camera's pose on the body; None where it does
+    not."""
 
-    camera: Camera | None = None
+    file: Path | None = None
+    values: dict[Any, Any] = field(default_factory=dict)
     how: str = ""
     T_body_camera: Floats | None = None
+
+    def camera(self, shape: tuple[int, ...], notes: list[str]) -> Camera | None:
+        return None if self.file is None else recorded_camera(self.file, self.values, shape, notes)
 
 
 def _list(folder: Path) -> tuple[Floats, list[Path]]:
@@ -97,23 +102,21 @@ def _list(folder: Path) -> tuple[Floats, list[Path]]:
     return np.array(times_ns, dtype=np.float64) / 1e9, [image for _, _, image in entries]
 
 
-def _found(root: Path, whole: Path, shape: tuple[int, ...], notes: list[str]) -> _Found:
-    sensor = root / _CAMERA / "sensor.yaml"
-    if sensor.is_file():
-        values = read_values(sensor)
-        camera = recorded_camera(sensor, values, shape, notes)
-        return _Found(camera, "sensor.yaml of cam0", _matrix(sensor, values.get("T_BS")))
+def _sensor(root: Path, whole: Path) -> _Sensor:
+    file = root / _CAMERA / "sensor.yaml"
+    if file.is_file():
+        values = read_values(file)
+        return _Sensor(file, values, "sensor.yaml of cam0", _matrix(file, values.get("T_BS")))
     chains = (whole / "dso" / "camchain.yaml", whole / "camchain.yaml")
     chain = next((one for one in chains if one.is_file()), None)
     if chain is None:
-        return _Found()
+        return _Sensor()
     left = read_values(chain).get(_CAMERA)
     if not isinstance(left, dict):
         raise DatasetError(f"{chain}: has no camera {_CAMERA}")
     T_camera_body = _matrix(chain, left.get("T_cam_imu"))
     T_body_camera = None if T_camera_body is None else invert(T_camera_body)
-    camera = recorded_camera(chain, left, shape, notes)
-    return _Found(camera, f"{_CAMERA} of {chain.name}", T_body_camera)
+    return _Sensor(chain, left, f"{_CAMERA} of {chain.name}", T_body_camera)
 
 
 def _matrix(path: Path, value: Any) -> Floats | None:
@@ -134,7 +137,7 @@ def _matrix(path: Path, value: Any) -> Floats | None:
 
 
 def _truth(
-    root: Path, whole: Path, timestamps_s: Floats, found: _Found, notes: list[str]
+    root: Path, whole: Path, timestamps_s: Floats, T_body_camera: Floats | None, notes: list[str]
 ) -> Trajectory | None:
     files = [*(root / name for name in _TRUTHS), whole / "dso" / "gt_imu.csv"]
     path = next((one for one in files if one.is_file()), None)
@@ -143,8 +146,8 @@ def _truth(
     body, repairs = read_tum_trajectory(path, timestamps_s)
     notes += [note for note in repairs if not any(usual in note for usual in _USUAL)]
     check_overlap(timestamps_s, body, path)
-    if found.T_body_camera is None:
+    if T_body_camera is None:
         notes.append("ground truth is of the body: where the camera is on it is not known")
         return body
     notes.append("ground truth of the body is that of the camera by T_BS")
-    return Trajectory(body.timestamps_s, body.T_world_camera @ found.T_body_camera, body.is_metric)
+    return Trajectory(body.timestamps_s, body.T_world_camera @ T_body_camera, body.is_metric)

@@ -65,7 +65,7 @@ def _open_tum(path: Path, camera: Camera | None) -> FileRecording:
     images = [image for image, _ in frames.values()]
     depths = [depth for _, depth in frames.values()]
     _, shape = first_image(tuple(images))
-    taken_by, source = camera_for(path, shape, camera, CAMERA, _HOW)
+    taken_by, source = camera_for(path, shape, camera, lambda: CAMERA, _HOW)
     times_s = np.array(numbers, dtype=np.float64) / CAMERA.fps
     files = sorted(path.glob(_TRUTH))
     if len(files) > 1:
@@ -116,7 +116,7 @@ def _open_own(path: Path, camera: Camera | None) -> Recording:
         raise DatasetError(f"{path}: no images scene_SS_NNNN.png")
     images = [frames[number] for number in sorted(frames)]
     _, shape = first_image(tuple(images))
-    taken_by, source = camera_for(path, shape, camera, CAMERA, _HOW)
+    taken_by, source = camera_for(path, shape, camera, lambda: CAMERA, _HOW)
     times_s = np.array(sorted(frames), dtype=np.float64) / CAMERA.fps
     poses = [_povray_pose(one) if is_file(one) else None for one in (i.with_suffix(".txt") for i in images)]
     rays = _ray_lengths(taken_by)

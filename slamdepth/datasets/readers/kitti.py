@@ -47,11 +47,7 @@ class KittiReader:
         timestamps_s, images, numbers = _times(path, images, numbers, notes)
         _, shape = first_image(tuple(images))
         projection = _projection(path / "calib.txt", f"P{folder.name[-1]}")
-        found = None
-        if projection is not None:
-            K = projection[:, :3]
-            found = Camera(shape[1], shape[0], K[0, 0], K[1, 1], K[0, 2], K[1, 2], fps=_FPS)
-        taken_by, source = camera_for(path, shape, camera, found, "calib.txt")
+        taken_by, source = camera_for(path, shape, camera, lambda: _camera(projection, shape), "calib.txt")
         truth = _truth(path, numbers, timestamps_s, projection, notes)
         notes.append(f"images of {folder.name}")
         name = f"kitti_{path.resolve().name}"
@@ -105,6 +101,13 @@ def _projection(path: Path, name: str) -> Floats | None:
             raise DatasetError(f"{path}:{number}: expected '{name}:' and twelve numbers of a projection")
         return P
     raise DatasetError(f"{path}: no line '{name}:' with twelve numbers")
+
+
+def _camera(projection: Floats | None, shape: tuple[int, ...]) -> Camera | None:
+    if projection is None:
+        return None
+    K = projection[:, :3]
+    return Camera(shape[1], shape[0], K[0, 0], K[1, 1], K[0, 2], K[1, 2], fps=_FPS)
 
 
 def _truth(

@@ -68,8 +68,9 @@ class NerfstudioReader:
         frames = _frames(file, values, notes)
         images = [frame.image for frame in frames]
         _, shape = first_image(tuple(images))
-        found = None if camera is not None else _camera(file, values, frames, shape, notes)
-        taken_by, source = camera_for(path, shape, camera, found, file.name)
+        taken_by, source = camera_for(
+            path, shape, camera, lambda: _camera(file, values, frames, shape, notes), file.name
+        )
         times_s = counted_times(len(frames), _FPS, notes)
         truth = trajectory_of(times_s, [frame.T_world_camera for frame in frames], notes, is_metric=False)
         recording = FileRecording(

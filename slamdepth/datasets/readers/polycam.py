@@ -58,8 +58,9 @@ class PolycamReader:
         if not images:
             raise DatasetError(f"{root}: no image in {kind}images has a file in {kind}cameras")
         _, shape = first_image(tuple(images))
-        found = None if camera is not None else _camera(root, files, shape, notes)
-        taken_by, source = camera_for(path, shape, camera, found, f"{kind}cameras of Polycam")
+        taken_by, source = camera_for(
+            path, shape, camera, lambda: _camera(root, files, shape, notes), f"{kind}cameras of Polycam"
+        )
         times_s = counted_times(len(images), _FPS, notes)
         truth = trajectory_of(times_s, [_pose(values) for values in files], notes)
         depths = [root / "depth" / f"{image.stem}.png" for image in images]

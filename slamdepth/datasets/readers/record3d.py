@@ -65,7 +65,7 @@ class Record3dReader:
 
         shape = _first_shape(path, image, len(names))
         taken_by, source = camera_for(
-            path, shape, camera, meta.camera(path, shape, notes), "metadata of Record3D"
+            path, shape, camera, lambda: meta.camera(path, shape, notes), "metadata of Record3D"
         )
         times_s = meta.times_s(numbers, notes)
         recording = Recording(

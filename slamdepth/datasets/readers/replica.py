@@ -49,10 +49,8 @@ class ReplicaReader:
         params = next(
             (one for one in (path / "cam_params.json", path.parent / "cam_params.json") if is_file(one)), None
         )
-        found, how = (KNOWN, "known by the layout of NICE-SLAM") if shape[:2] == (680, 1200) else (None, "")
-        if params is not None:
-            found, how = _camera(params), params.name
-        taken_by, source = camera_for(path, shape, camera, found, how)
+        how = "known by the layout of NICE-SLAM" if params is None else params.name
+        taken_by, source = camera_for(path, shape, camera, lambda: _camera(params, shape), how)
         times_s = counted_times(max(numbers) + 1, _FPS, notes)[numbers]
         depths = [image.with_name(f"depth{image.stem.removeprefix('frame')}.png") for image in images]
         truth = None
@@ -67,7 +65,10 @@ class ReplicaReader:
         return recording
 
 
-def _camera(path: Path) -> Camera:
+def _camera(path: Path | None, shape: tuple[int, ...]) -> Camera | None:
+    """The camera by ``cam_params.json``; where there is none, the known one if it fits the images."""
+    if path is None:
+        return KNOWN if shape[:2] == (KNOWN.height, KNOWN.width) else None
     values: Any = read_json(path)
     values = values.get("camera") if isinstance(values, dict) else None
     names = ("w", "h", "fx", "fy", "cx", "cy", "scale")

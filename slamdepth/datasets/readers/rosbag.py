@@ -83,8 +83,9 @@ class RosbagReader:
         index = bag.index(view.topic)
         notes += [index.note] if index.note else []
         shape = _first_shape(bag, view)
-        found = None if camera is not None else _camera_of(bag, view, shape, notes)
-        taken_by, source = camera_for(path, shape, camera, found, f"camera_info of {view.topic}")
+        taken_by, source = camera_for(
+            path, shape, camera, lambda: _camera_of(bag, view, shape, notes), f"camera_info of {view.topic}"
+        )
         truth = None
         if options.pose_topic is not None:
             truth = poses_of_topic(bag, options.pose_topic, index.times_s, view.frame, notes)

@@ -45,8 +45,13 @@ class ScanNetReader:
         if not images:
             raise DatasetError(f"{path / 'color'}: no images that are named by a number")
         _, shape = first_image(tuple(images))
-        found = _camera(path / "intrinsic", shape, notes)
-        taken_by, source = camera_for(path, shape, camera, found, "intrinsic/intrinsic_color.txt")
+        taken_by, source = camera_for(
+            path,
+            shape,
+            camera,
+            lambda: _camera(path / "intrinsic", shape, notes),
+            "intrinsic/intrinsic_color.txt",
+        )
         times_s = np.array([int(image.stem) for image in images], dtype=np.float64) / FPS
         if not (np.diff(times_s) > 0).all():
             raise DatasetError(f"{path / 'color'}: two images have the same number")

@@ -49,8 +49,9 @@ class ScanNetSensReader:
         notes: list[str] = []
         file = _Sens(path, notes)
         shape = (file.color_size[1], file.color_size[0], 3)
-        found = camera_of(path, file.K, shape)
-        taken_by, source = camera_for(path, shape, camera, found, "the .sens file")
+        taken_by, source = camera_for(
+            path, shape, camera, lambda: camera_of(path, file.K, shape), "the .sens file"
+        )
         times_s = file.times_s()
         truth = trajectory_of(times_s, [frame.pose for frame in file.frames], notes)
         if truth is not None:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slamdepth.datasets.intrinsics import CameraSource
 from slamdepth.datasets.orientation import UPRIGHT, turned_camera, turned_image, turned_rotation
 from slamdepth.datasets.poses import pose_of, read_matrix, trajectory_of
 from slamdepth.datasets.readers.record3d import ARKIT
@@ -47,12 +48,9 @@ class StrayScannerReader:
     def open(self, path: Path, camera: Camera | None) -> StraySequence:
         notes: list[str] = []
         video = VideoFile(path / _VIDEO)
-        found = None
-        if (path / _MATRIX).is_file():
-            found = _camera(path / _MATRIX, video)
-        taken_by, source = camera_for(path, (video.height, video.width, 3), camera, found, _MATRIX)
-        sequence = StraySequence(path, video, taken_by, notes)
-        sequence.camera_source = source
+        shape = (video.height, video.width, 3)
+        taken_by, source = camera_for(path, shape, camera, lambda: _camera(path / _MATRIX, video), _MATRIX)
+        sequence = StraySequence(path, video, taken_by, notes, source)
         if (path / _ODOMETRY).is_file():
             sequence.take_odometry(_odometry(path / _ODOMETRY))
         return sequence
@@ -73,8 +71,10 @@ class StraySequence(VideoSequence):
         taken_by: the camera of upright frames in the video's own size.
     """
 
-    def __init__(self, path: Path, video: VideoFile, taken_by: Camera, notes: list[str]) -> None:
-        super().__init__(video, replace(taken_by, depth_factor=_MILLIMETRES), notes)
+    def __init__(
+        self, path: Path, video: VideoFile, taken_by: Camera, notes: list[str], source: CameraSource
+    ) -> None:
+        super().__init__(video, replace(taken_by, depth_factor=_MILLIMETRES), notes, source)
         self.name, self.path = path.resolve().name, path
         self._orientation = video.orientation
         self.has_depth = any(is_file(self._depth_path(index)) for index in range(len(self)))
@@ -126,7 +126,9 @@ class StraySequence(VideoSequence):
         return self.path / "depth" / f"{index:06d}.png"
 
 
-def _camera(path: Path, video: VideoFile) -> Camera:
+def _camera(path: Path, video: VideoFile) -> Camera | None:
+    if not path.is_file():
+        return None
     K = read_matrix(path, 3, rows=3)
     is_turned = video.orientation >= 5
     size = (video.height, video.width) if is_turned else (video.width, video.height)
