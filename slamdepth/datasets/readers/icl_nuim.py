@@ -88,7 +88,7 @@ def _associations(path: Path) -> dict[int, tuple[Path, Path | None]]:
     file = path / "associations.txt"
     found: dict[int, tuple[Path, Path | None]] = {}
     if not file.is_file():
-        for image in (path / "rgb").glob("*.png"):
+        for image in sorted((path / "rgb").glob("*.png")):
             if image.stem.isdecimal() and len(image.stem) < 10:
                 depth = path / "depth" / image.name
                 found[int(image.stem)] = (image, depth if is_file(depth) else None)

@@ -53,7 +53,7 @@ class Record3dReader:
         members = Members(path)
         meta = _metadata(members)
         notes: list[str] = []
-        matched = {name: _IMAGE.fullmatch(name) for name in members.names}
+        matched = {name: _IMAGE.fullmatch(name) for name in sorted(members.names)}
         frames = {int(found[1]): name for name, found in matched.items() if found}
         if not frames:
             raise DatasetError(f"{path}: no images rgbd/N.jpg or rgb/N.jpg")

@@ -39,7 +39,7 @@ class ReplicaReader:
 
     def open(self, path: Path, camera: Camera | None) -> FileRecording:
         notes: list[str] = []
-        matched = {image: _FRAME.fullmatch(image.name) for image in (path / "results").iterdir()}
+        matched = {image: _FRAME.fullmatch(image.name) for image in sorted((path / "results").iterdir())}
         frames = {int(name[1]): image for image, name in matched.items() if name}
         if not frames:
             raise DatasetError(f"{path / 'results'}: no images frameNNNNNN.jpg")
