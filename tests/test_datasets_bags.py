@@ -346,6 +346,17 @@ def test_stamps_that_are_not_set_give_way_to_the_recorders_times(tmp_path: Path)
     assert any("those of the recorder" in note for note in dataset.notes)
 
 
+def test_what_is_assumed_of_times_is_told_of_images_and_of_depth(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.bag", "ros1") as bag:
+        for i, t in enumerate([*times(), times()[-1]]):
+            bag.write("/cam/image_raw", bag.image(0.0, FRAME, image_rgb(i), "rgb8"), t)
+            bag.write("/cam/aligned_depth", bag.image(0.0, FRAME, depth_raw(i), "16UC1"), t)
+    dataset = open_dataset(tmp_path / "a.bag")
+    for topic in ("/cam/image_raw", "/cam/aligned_depth"):
+        assert f"{topic}: stamps are not set; times are those of the recorder" in dataset.notes
+        assert f"{topic}: 1 messages repeat a time and are left out" in dataset.notes
+
+
 def test_messages_out_of_order_come_in_the_order_of_their_stamps(tmp_path: Path) -> None:
     order = [0, 1, 3, 2, 4, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20]
     with BagWriter(tmp_path / "a.bag", "ros1") as bag:

@@ -40,13 +40,13 @@ class TopicIndex:
         times_s: ``(N,)`` strictly increasing: stamps of the headers, or of the recorder.
         positions: ``(N,)`` place of each in the order of the bag.
         bag_ns: ``(M,)`` the recorder's times of all messages, in the order of the bag.
-        note: what was dropped or assumed; empty where nothing was.
+        notes: what was dropped or assumed, one line each.
     """
 
     times_s: Floats
     positions: Any
     bag_ns: Any
-    note: str
+    notes: tuple[str, ...]
 
 
 class BagFile:
@@ -77,14 +77,17 @@ class BagFile:
         """
         return next(self.messages(topic), None)
 
-    def messages(self, topic: str) -> Iterator[Any]:
+    def messages(self, topic: str, start_ns: int | None = None) -> Iterator[Any]:
         """The messages of a topic in the order of the bag.
+
+        Args:
+            start_ns: the recorder's time of the first one; None: all.
 
         Raises:
             DatasetError: the bag is damaged.
         """
         with self._told():
-            for connection, _, raw in self._reader.messages(self._connections(topic)):
+            for connection, _, raw in self._reader.messages(self._connections(topic), start=start_ns):
                 yield self._reader.deserialize(raw, connection.msgtype)
 
     def index(self, topic: str) -> TopicIndex:
@@ -102,24 +105,20 @@ class BagFile:
         if not bag_ns:
             raise DatasetError(f"{self.path}: topic {topic} has no messages")
         recorded, stamps = np.array(bag_ns, np.int64), np.array(stamps_ns, np.int64)
-        times_ns, note = stamps, ""
+        times_ns, notes = stamps, list[str]()
         if not _are_usable(stamps):
-            times_ns, note = recorded, f"{topic}: stamps are not set; times are those of the recorder"
+            times_ns = recorded
+            notes.append(f"{topic}: stamps are not set; times are those of the recorder")
         order = np.argsort(times_ns, kind="stable")
         keep = np.concatenate([[True], np.diff(times_ns[order]) > 0])
         if not keep.all():
-            note = f"{topic}: {np.count_nonzero(~keep)} messages repeat a time and are left out"
+            notes.append(f"{topic}: {np.count_nonzero(~keep)} messages repeat a time and are left out")
         positions = order[keep]
-        return TopicIndex(times_ns[positions] / 1e9, positions, recorded, note)
+        return TopicIndex(times_ns[positions] / 1e9, positions, recorded, tuple(notes))
 
     def reader_of(self, topic: str, index: TopicIndex) -> TopicReader:
         """Reads single messages of a topic, with a file handle of its own."""
         return TopicReader(BagFile(self.path), topic, index)
-
-    def _from(self, topic: str, start_ns: int) -> Iterator[Any]:
-        with self._told():
-            for connection, _, raw in self._reader.messages(self._connections(topic), start=start_ns):
-                yield self._reader.deserialize(raw, connection.msgtype)
 
     def _connections(self, topic: str) -> list[Any]:
         return [connection for connection in self._reader.connections if connection.topic == topic]
@@ -175,7 +174,7 @@ class TopicReader:
                 start_ns = int(self._index.bag_ns[position])
                 # Several messages may have been recorded at one time.
                 self._next = int(np.searchsorted(self._index.bag_ns, start_ns, side="left"))
-                self._messages = self._bag._from(self._topic, start_ns)
+                self._messages = self._bag.messages(self._topic, start_ns)
             while True:
                 message = next(self._messages, None)
                 self._next += 1

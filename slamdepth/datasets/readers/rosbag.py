@@ -81,7 +81,7 @@ class RosbagReader:
         views = _views(bag)
         view = _chosen_view(bag, views, options.topic, notes)
         index = bag.index(view.topic)
-        notes += [index.note] if index.note else []
+        notes += index.notes
         shape = _first_shape(bag, view)
         taken_by, source = camera_for(
             path, shape, camera, lambda: _camera_of(bag, view, shape, notes), f"camera_info of {view.topic}"
@@ -309,6 +309,7 @@ def _depth_of(
             return None
         chosen = min(fitting, key=lambda one: (one.is_compressed, one.topic))
     found = bag.index(chosen.topic)
+    notes += found.notes
     numbers = [-1] * len(index.times_s)
     for i, j in associate(index.times_s, found.times_s, MAX_TIME_DIFFERENCE_S):
         numbers[i] = j
