@@ -21,7 +21,7 @@ from slamdepth.datasets.orientation import check_size
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
 from slamdepth.datasets.sequence import is_file
 from slamdepth.errors import CameraError, DatasetError
-from slamdepth.io import read_depth_file, read_depth_m, read_image_rgb
+from slamdepth.io import read_depth_m, read_image_rgb
 from slamdepth.types import Camera, Frame, Trajectory
 from slamdepth.typing import Bytes, Floats, Floats32
 
@@ -128,7 +128,6 @@ class FileRecording(Recording):
 
     Args:
         depth_paths: None where there are none; integers are in units of ``camera.depth_factor`` a metre.
-        confidence_paths: ``N`` images of the depth's size; where they are 0, depth is unknown.
     """
 
     def __init__(
@@ -140,14 +139,12 @@ class FileRecording(Recording):
         image_paths: Sequence[Path],
         *,
         depth_paths: Sequence[Path | None] | None = None,
-        confidence_paths: Sequence[Path | None] | None = None,
         truth: Trajectory | None = None,
         notes: Sequence[str] = (),
         source: CameraSource | None = None,
     ) -> None:
         self.image_paths = tuple(image_paths)
         self.depth_paths = tuple(depth_paths or (None,) * len(self.image_paths))
-        self._confidence_paths = tuple(confidence_paths or (None,) * len(self.image_paths))
         self._depth_factor = camera.depth_factor
         missing = sum(not is_file(one) for one in self.image_paths)
         if missing == len(self.image_paths):
@@ -177,15 +174,8 @@ class FileRecording(Recording):
         return (*self.image_paths, *(path for path in self.depth_paths if path is not None))
 
     def _depth_of(self, index: int) -> Floats32 | None:
-        path, confidence_path = self.depth_paths[index], self._confidence_paths[index]
-        if path is None:
-            return None
-        depth_m = read_depth_m(path, self._depth_factor)
-        if confidence_path is not None:
-            confidence = read_depth_file(confidence_path)
-            if confidence.shape == depth_m.shape:
-                depth_m[confidence == 0] = 0.0
-        return depth_m
+        path = self.depth_paths[index]
+        return None if path is None else read_depth_m(path, self._depth_factor)
 
 
 def resized_depth(depth_m: Floats32, camera: Camera, what: str) -> Floats32:
