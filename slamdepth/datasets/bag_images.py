@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from slamdepth.errors import ImageDecodeError
-from slamdepth.io import decode_image, decode_image_rgb
+from slamdepth.io import decode_image, decode_image_rgb, metres_of_raw
 from slamdepth.typing import Bytes, Floats32
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -106,7 +106,7 @@ def depth_m(message: Any, what: str) -> Floats32:
             f"{what}: images of encoding {encoding[:40]!r} are no depth; needed is 16UC1 (millimetres) or "
             "32FC1 (metres)"
         )
-    return _metres(_pixels(message, np.dtype(_DEPTH[encoding]), 1, what))
+    return metres_of_raw(_pixels(message, np.dtype(_DEPTH[encoding]), 1, what), _MILLIMETRES)
 
 
 def _compressed_depth(data: bytes, encoding: str, what: str) -> Floats32:
@@ -119,21 +119,13 @@ def _compressed_depth(data: bytes, encoding: str, what: str) -> Floats32:
             f"{what}: a depth image has one channel of 16 bits, this is {raw.shape} {raw.dtype}"
         )
     if not encoding.startswith("32fc1"):
-        return _metres(raw)
+        return metres_of_raw(raw, _MILLIMETRES)
     if start < _DEPTH_HEADER.size:
         raise ImageDecodeError(f"{what}: compressed depth of floats without its header")
     _, a, b = _DEPTH_HEADER.unpack_from(data)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         metres = np.where(raw > 0, a / (raw.astype(np.float32) - np.float32(b)), 0.0)
-    return _metres(metres.astype(np.float32))
-
-
-def _metres(raw: Any) -> Floats32:
-    if raw.dtype == np.uint16:
-        return np.asarray(raw.astype(np.float32) / np.float32(_MILLIMETRES))
-    metres = np.array(raw, dtype=np.float32)
-    metres[~(np.isfinite(metres) & (metres > 0))] = 0.0
-    return metres
+    return metres_of_raw(metres)
 
 
 def _pixels(message: Any, dtype: Any, channels: int, what: str) -> Any:

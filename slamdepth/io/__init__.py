@@ -8,6 +8,7 @@ from slamdepth.io.hashing import sha256_of
 from slamdepth.io.images import (
     decode_image,
     decode_image_rgb,
+    metres_of_raw,
     read_depth_file,
     read_depth_m,
     read_depth_raw,
@@ -28,6 +29,7 @@ __all__ = [
     "decode_image_rgb",
     "encode_ply",
     "format_timestamp",
+    "metres_of_raw",
     "parse_float",
     "read_depth_file",
     "read_depth_m",

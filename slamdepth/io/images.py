@@ -115,6 +115,16 @@ def read_depth_m(path: str | Path, depth_factor: float, *, unknown_raw: Sequence
         raise ImageDecodeError(
             f"{path}: a depth image has one channel of 16 bits or of floats, this is {raw.shape} {raw.dtype}"
         )
+    return metres_of_raw(raw, depth_factor, unknown_raw=unknown_raw)
+
+
+def metres_of_raw(
+    raw: NDArray[Any], depth_factor: float = 1.0, *, unknown_raw: Sequence[int] = ()
+) -> Floats32:
+    """Depth ``(H, W)`` in metres, float32, 0 where unknown, of values as a file holds them.
+
+    Arguments as those of :func:`read_depth_m`, which reads the file.
+    """
     depth_m: Floats32
     if raw.dtype.kind == "f":
         with np.errstate(over="ignore"):

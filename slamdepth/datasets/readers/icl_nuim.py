@@ -22,7 +22,7 @@ from slamdepth.datasets.recording import FileRecording, Recording, camera_for
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import first_image, is_file
 from slamdepth.errors import DatasetError, ImageDecodeError
-from slamdepth.io import parse_float, read_image_rgb, read_lines
+from slamdepth.io import metres_of_raw, parse_float, read_image_rgb, read_lines
 from slamdepth.types import Camera, Trajectory
 from slamdepth.typing import Floats, Floats32
 
@@ -185,6 +185,4 @@ def _depth_of(path: Path, rays: Floats) -> Floats32:
         raise ImageDecodeError(f"{path}: cannot be read: {error}") from error
     if values.size != rays.size:
         raise ImageDecodeError(f"{path}: holds {values.size} numbers, expected {rays.size}")
-    depth_m = values.reshape(rays.shape) / rays
-    depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0.0
-    return depth_m.astype(np.float32)
+    return metres_of_raw(values.reshape(rays.shape) / rays)

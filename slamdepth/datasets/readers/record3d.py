@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from slamdepth.datasets.members import Members
+from slamdepth.datasets.members import LARGEST_MEMBER, Members
 from slamdepth.datasets.poses import OPENCV_OF_OPENGL, pose_of, trajectory_of
 from slamdepth.datasets.recording import Recording, camera_for, counted_times
 from slamdepth.datasets.registry import register_reader
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
-from slamdepth.io import decode_image_rgb, read_depth_m
+from slamdepth.io import decode_image_rgb, metres_of_raw, read_depth_m
 from slamdepth.types import Camera, Trajectory
 from slamdepth.typing import Bytes, Floats, Floats32
 
@@ -175,9 +175,9 @@ def _first_shape(path: Path, image: Callable[[int], Bytes], count: int) -> tuple
     raise DatasetError(f"{path}: none of the {count} images decodes; the first: {trouble}")
 
 
-def _read(members: Members, name: str, largest: int | None = None) -> bytes:
+def _read(members: Members, name: str, largest: int = LARGEST_MEMBER) -> bytes:
     try:
-        return members.read(name) if largest is None else members.read(name, largest)
+        return members.read(name, largest)
     except DatasetError as error:  # one damaged member costs its frame, not the run
         raise ImageDecodeError(str(error)) from error
 
@@ -218,8 +218,7 @@ def _packed_depth(members: Members, number: int, shape: tuple[int, ...], meta: _
     size = (round(height), round(width))
     if size[0] * size[1] != values.size or not values.size:
         raise ImageDecodeError(f"{members.path}: {name} holds {values.size} values, not of the image's shape")
-    depth_m: Floats32 = values.reshape(size).copy()
-    depth_m[~(np.isfinite(depth_m) & (depth_m > 0))] = 0.0
+    depth_m = metres_of_raw(values.reshape(size))
     conf = f"rgbd/{number}.conf"
     if conf in members.names:
         confidence = np.frombuffer(_unpacked(members, conf), np.uint8)

@@ -20,7 +20,7 @@ from slamdepth.datasets.readers.scannet import FPS, TRUTH, camera_of
 from slamdepth.datasets.recording import Recording, camera_for
 from slamdepth.datasets.registry import register_reader
 from slamdepth.errors import DatasetError, ImageDecodeError
-from slamdepth.io import decode_image_rgb
+from slamdepth.io import decode_image_rgb, metres_of_raw
 from slamdepth.types import Camera
 from slamdepth.typing import Bytes, Floats, Floats32
 
@@ -139,7 +139,7 @@ class _Sens:
         if len(data) != 2 * width * height:
             raise ImageDecodeError(f"{what}: {len(data)} bytes, expected {2 * width * height}")
         raw = np.frombuffer(data, "<u2").reshape(height, width)
-        return np.asarray(raw.astype(np.float32) / np.float32(self._shift))
+        return metres_of_raw(raw, self._shift)
 
     def _index(self, file: BinaryIO, size: int) -> None:
         at = file.tell()
