@@ -28,6 +28,8 @@ from slamdepth.typing import Bytes, Floats, Floats32
 _SCALED_TOLERANCE = 0.01
 _ASPECT_TOLERANCE = 0.02
 """Rounding of the sides of a small depth image."""
+_FOCAL_SPREAD = 0.02
+"""Focal lengths of frames that differ by more are told of."""
 
 
 class Recording(Dataset):
@@ -254,6 +256,24 @@ def recorded_camera(
         )
     notes.append(f"intrinsics of {camera.width}x{camera.height} are scaled to images of {width}x{height}")
     return camera.scaled(width, height)
+
+
+def name_truth(dataset: Dataset, source: str) -> None:
+    """Tell what the ground truth of a sequence is, if it has one, where no second system measured it."""
+    if dataset.ground_truth is not None:
+        dataset.truth_source = source
+        dataset.notes.append(f"ground truth: {source}")
+
+
+def middle_focal(focals_px: Floats, what: str, notes: list[str]) -> int:
+    """Which of the focal lengths ``(N,)`` of the frames is the middle one: phones refocus.
+
+    Args:
+        what: names them in the line that ``notes`` takes where they differ much.
+    """
+    if focals_px.max() > (1.0 + _FOCAL_SPREAD) * focals_px.min():
+        notes.append(f"{what} is {focals_px.min():.1f} to {focals_px.max():.1f}; that of the middle is taken")
+    return int(np.argmin(np.abs(focals_px - np.median(focals_px))))
 
 
 def counted_times(count: int, fps: float, notes: list[str]) -> Floats:

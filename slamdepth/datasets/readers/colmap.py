@@ -9,7 +9,7 @@ from pathlib import Path
 from slamdepth.datasets.colmap_model import ColmapImage, is_model, read_model
 from slamdepth.datasets.image_files import natural_key
 from slamdepth.datasets.poses import trajectory_of
-from slamdepth.datasets.recording import FileRecording, camera_for, counted_times, recorded_camera
+from slamdepth.datasets.recording import FileRecording, camera_for, counted_times, name_truth, recorded_camera
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import first_image, is_file
 from slamdepth.errors import DatasetError
@@ -67,9 +67,7 @@ class ColmapReader:
         recording = FileRecording(
             path.resolve().name, path, taken_by, times_s, paths, truth=truth, notes=notes, source=source
         )
-        if truth is not None:
-            recording.truth_source = _TRUTH
-            recording.notes.append(f"ground truth: {_TRUTH}")
+        name_truth(recording, _TRUTH)
         return recording
 
 

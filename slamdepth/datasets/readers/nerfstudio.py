@@ -16,7 +16,14 @@ import numpy as np
 
 from slamdepth.datasets.image_files import IMAGE_ENDINGS, natural_key
 from slamdepth.datasets.poses import OPENCV_OF_OPENGL, trajectory_of
-from slamdepth.datasets.recording import FileRecording, camera_for, counted_times, recorded_camera
+from slamdepth.datasets.recording import (
+    FileRecording,
+    camera_for,
+    counted_times,
+    middle_focal,
+    name_truth,
+    recorded_camera,
+)
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import first_image, is_file
 from slamdepth.errors import CameraError, DatasetError
@@ -45,8 +52,6 @@ _LENS = (
     "w",
     "h",
 )
-_SPREAD = 0.02
-"""Focal lengths of frames that differ by more are told of: phones refocus."""
 
 
 @register_reader
@@ -77,9 +82,7 @@ class NerfstudioReader:
             file.parent.resolve().name, file.parent, taken_by, times_s, images, truth=truth, notes=notes,
             source=source, depth_paths=[frame.depth for frame in frames],
         )  # fmt: skip
-        if truth is not None:
-            recording.truth_source = _TRUTH
-            recording.notes.append(f"ground truth: {_TRUTH}")
+        name_truth(recording, _TRUTH)
         return recording
 
 
@@ -150,11 +153,7 @@ def _camera(
     focals = np.array([lens["fl_x"] for lens in cameras if "fl_x" in lens])
     if len(focals) == 0:
         return None
-    lens = dict(cameras[int(np.argmin(np.abs(focals - np.median(focals))))])
-    if focals.max() > (1.0 + _SPREAD) * focals.min():
-        notes.append(
-            f"{file.name}: fl_x is {focals.min():.1f} to {focals.max():.1f}; that of the middle is taken"
-        )
+    lens = dict(cameras[middle_focal(focals, f"{file.name}: fl_x", notes)])
     height, width = shape[:2]
     if "w" not in lens or "h" not in lens:
         lens["w"], lens["h"] = float(width), float(height)

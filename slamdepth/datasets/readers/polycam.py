@@ -17,7 +17,14 @@ import numpy as np
 
 from slamdepth.datasets.image_files import has_images, list_images
 from slamdepth.datasets.poses import OPENCV_OF_OPENGL, trajectory_of
-from slamdepth.datasets.recording import FileRecording, camera_for, counted_times, recorded_camera
+from slamdepth.datasets.recording import (
+    FileRecording,
+    camera_for,
+    counted_times,
+    middle_focal,
+    name_truth,
+    recorded_camera,
+)
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import first_image, is_file
 from slamdepth.errors import CameraError, DatasetError
@@ -68,9 +75,7 @@ class PolycamReader:
             path.resolve().name, path, taken_by, times_s, images, truth=truth, notes=notes, source=source,
             depth_paths=[depth if is_file(depth) else None for depth in depths],
         )  # fmt: skip
-        if truth is not None:
-            recording.truth_source = _TRUTH
-            recording.notes.append(f"ground truth: {_TRUTH}")
+        name_truth(recording, _TRUTH)
         return recording
 
 
@@ -97,11 +102,8 @@ def _values(file: Path) -> dict[str, float]:
 
 
 def _camera(root: Path, files: list[dict[str, float]], shape: tuple[int, ...], notes: list[str]) -> Camera:
-    """The camera of the middle one by its focal length: phones refocus."""
-    focals = np.array([values["fx"] for values in files])
-    lens = files[int(np.argmin(np.abs(focals - np.median(focals))))]
-    if focals.max() > 1.02 * focals.min():
-        notes.append(f"fx is {focals.min():.1f} to {focals.max():.1f}; that of the middle is taken")
+    """The camera of the middle one by its focal length."""
+    lens = files[middle_focal(np.array([values["fx"] for values in files]), "fx", notes)]
     calibration = {
         "image_width": round(lens["width"]),
         "image_height": round(lens["height"]),

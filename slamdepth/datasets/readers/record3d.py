@@ -20,7 +20,7 @@ import numpy as np
 
 from slamdepth.datasets.members import LARGEST_MEMBER, Members
 from slamdepth.datasets.poses import OPENCV_OF_OPENGL, pose_of, trajectory_of
-from slamdepth.datasets.recording import Recording, camera_for, counted_times
+from slamdepth.datasets.recording import Recording, camera_for, counted_times, name_truth
 from slamdepth.datasets.registry import register_reader
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
 from slamdepth.io import decode_image_rgb, metres_of_raw, read_depth_m
@@ -80,9 +80,7 @@ class Record3dReader:
             source=source,
             files=[path / name for name in names] if path.is_dir() else (),
         )
-        recording.truth_source = ARKIT if recording.ground_truth is not None else ""
-        if recording.truth_source:
-            recording.notes.append(f"ground truth: {ARKIT}")
+        name_truth(recording, ARKIT)
         return recording
 
 

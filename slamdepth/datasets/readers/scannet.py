@@ -13,7 +13,7 @@ import numpy as np
 
 from slamdepth.datasets.image_files import has_images, list_images
 from slamdepth.datasets.poses import read_matrix, trajectory_of
-from slamdepth.datasets.recording import FileRecording, camera_for
+from slamdepth.datasets.recording import FileRecording, camera_for, name_truth
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import first_image, is_file
 from slamdepth.errors import CameraError, DatasetError
@@ -59,13 +59,11 @@ class ScanNetReader:
         files = [path / "pose" / f"{image.stem}.txt" for image in images]
         poses = [read_matrix(file, 4, rows=4) if is_file(file) else None for file in files]
         truth = trajectory_of(times_s, poses, notes)
-        if truth is not None:
-            notes.append(f"ground truth: {TRUTH}")
         recording = FileRecording(
             path.resolve().name, path, taken_by, times_s, images, truth=truth, notes=notes, source=source,
             depth_paths=[depth if is_file(depth) else None for depth in depths],
         )  # fmt: skip
-        recording.truth_source = TRUTH if truth is not None else ""
+        name_truth(recording, TRUTH)
         return recording
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from slamdepth.datasets.poses import trajectory_of
 from slamdepth.datasets.readers.scannet import FPS, TRUTH, camera_of
-from slamdepth.datasets.recording import Recording, camera_for
+from slamdepth.datasets.recording import Recording, camera_for, name_truth
 from slamdepth.datasets.registry import register_reader
 from slamdepth.errors import DatasetError, ImageDecodeError
 from slamdepth.io import decode_image_rgb, metres_of_raw
@@ -54,8 +54,6 @@ class ScanNetSensReader:
         )
         times_s = file.times_s()
         truth = trajectory_of(times_s, [frame.pose for frame in file.frames], notes)
-        if truth is not None:
-            notes.append(f"ground truth: {TRUTH}")
         recording = Recording(
             path.stem,
             path,
@@ -67,7 +65,7 @@ class ScanNetSensReader:
             notes=notes,
             source=source,
         )
-        recording.truth_source = TRUTH if truth is not None else ""
+        name_truth(recording, TRUTH)
         return recording
 
 

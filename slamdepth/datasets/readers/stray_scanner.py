@@ -19,7 +19,7 @@ from slamdepth.datasets.orientation import UPRIGHT, turned_camera, turned_image,
 from slamdepth.datasets.poses import pose_of, read_matrix, trajectory_of
 from slamdepth.datasets.readers.record3d import ARKIT
 from slamdepth.datasets.readers.video import VideoSequence
-from slamdepth.datasets.recording import camera_for, resized_depth
+from slamdepth.datasets.recording import camera_for, name_truth, resized_depth
 from slamdepth.datasets.registry import register_reader
 from slamdepth.datasets.sequence import is_file
 from slamdepth.datasets.video import VideoFile
@@ -91,9 +91,7 @@ class StraySequence(VideoSequence):
         T_stored_upright = invert(turned_rotation(self._orientation))
         turned = [None if T is None else T @ T_stored_upright for T in poses]
         self.ground_truth = trajectory_of(self.timestamps_s, turned, self.notes)
-        if self.ground_truth is not None:
-            self.truth_source = ARKIT
-            self.notes.append(f"ground truth: {ARKIT}")
+        name_truth(self, ARKIT)
 
     def read(self, index: int, *, with_depth: bool = False) -> Frame:
         """Read one frame; see :meth:`slamdepth.datasets.base.Dataset.read`.
