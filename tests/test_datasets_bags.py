@@ -244,7 +244,7 @@ def test_images_of_impossible_sizes_do_not_decode() -> None:
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_poses_become_ground_truth_only_where_asked_for(tmp_path: Path, kind: str) -> None:
-    T_world_base, T_base_camera = poses(COUNT, 1), poses(1, 2)[0]
+    T_world_base = poses(COUNT, 1)
     T_world_base[:, :3, :3] = T_world_base[0, :3, :3]  # so that poses in between are known exactly
     static = poses(2, 3)
 

@@ -128,10 +128,7 @@ def test_archives_are_refused_with_the_command_that_unpacks_them(tmp_path: Path)
     ):
         done = call("info", tmp_path / name)
         assert done.returncode == 2
-        assert (
-            command.format(tmp_path / name).replace(f"{tmp_path}/room.tgz", f"{tmp_path}/room.tgz")
-            in done.stderr
-        )
+        assert command.format(tmp_path / name) in done.stderr
 
 
 def test_info_as_a_process_of_its_own(tmp_path: Path) -> None:

@@ -24,6 +24,4 @@ def test_damaged_input_ends_in_one_line_or_a_sound_result(name: str, tmp_path: P
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_undamaged_input_is_read(name: str, tmp_path: Path) -> None:
-    path = TARGETS[name].make(tmp_path)
-    if name != "video":  # it has no camera
-        TARGETS[name].read(path)
+    TARGETS[name].read(TARGETS[name].make(tmp_path))

@@ -8,7 +8,6 @@ some, which are counted, and is never behind.
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import time
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from slamdepth.datasets.base import Dataset
 from slamdepth.datasets.intrinsics import CameraSource
 from slamdepth.datasets.resizing import reduced_camera, reduced_image
+from slamdepth.datasets.video import quiet_capture
 from slamdepth.errors import DatasetError, ImageDecodeError, SourceEnded
 from slamdepth.types import Camera, Frame, Trajectory
 from slamdepth.typing import Bytes, Floats
@@ -202,21 +202,16 @@ class LiveSequence(Dataset):
 def _opened(source: int | str, name: str, stall_s: float) -> Any:
     import cv2
 
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        if isinstance(source, int):
-            capture = cv2.VideoCapture(source)
-        else:
-            limits = [
-                cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
-                round(1e3 * min(stall_s, _OPENING_S)),
-                cv2.CAP_PROP_READ_TIMEOUT_MSEC,
-                round(1e3 * stall_s),
-            ]
-            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+    if isinstance(source, int):
+        capture = quiet_capture(source)
+    else:
+        limits = [
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+            round(1e3 * min(stall_s, _OPENING_S)),
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+            round(1e3 * stall_s),
+        ]
+        capture = quiet_capture(source, cv2.CAP_FFMPEG, limits)
     if not capture.isOpened():
         what = "no such camera, or another program uses it" if isinstance(source, int) else "no video there"
         raise DatasetError(f"{name}: cannot be opened: {what}")

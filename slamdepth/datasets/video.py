@@ -47,8 +47,6 @@ class VideoFile:
 
         if not path.is_file():
             raise DatasetError(f"{path}: no such video file")
-        # FFmpeg prints errors of its own, as OpenCV does in _open; they would break the progress bar.
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         self.path = path
         self.notes: list[str] = []
         capture = self._open()
@@ -135,11 +133,7 @@ class VideoFile:
     def _open(self) -> Any:
         import cv2
 
-        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        try:
-            capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
-        finally:
-            cv2.utils.logging.setLogLevel(level)
+        capture = quiet_capture(str(self.path), cv2.CAP_FFMPEG)
         if not capture.isOpened():
             raise DatasetError(f"{self.path}: no video that can be read: cut short, or of an unknown format")
         return capture
@@ -151,3 +145,15 @@ class VideoFile:
         if not decoded or image is None or image.shape != (self.height, self.width, 3):
             raise ImageDecodeError(f"{self.path.name}: frame {index} does not decode")
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def quiet_capture(*arguments: Any) -> Any:
+    """OpenCV's ``VideoCapture``; it and FFmpeg print no errors, which would break the progress bar."""
+    import cv2
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.VideoCapture(*arguments)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
