@@ -9,13 +9,11 @@ from slamdepth.errors import ConfigError
 from slamdepth.mapstore import Map
 from slamdepth.tracking.cloud_tracker import CloudTracker
 from slamdepth.tracking.map_localiser import MapLocaliser
+from slamdepth.tracking.snapshot import MapSnapshot, Watched
 from slamdepth.tracking.tracker import Tracker
 from slamdepth.types import Camera
 
-__all__ = ["CloudTracker", "MapLocaliser", "Tracker", "create_tracker"]
-from slamdepth.tracking.snapshot import MapSnapshot, Watched
-
-__all__ = ["CloudTracker", "MapSnapshot", "Tracker", "Watched", "create_tracker"]
+__all__ = ["CloudTracker", "MapLocaliser", "MapSnapshot", "Tracker", "Watched", "create_tracker"]
 
 
 def create_tracker(
