@@ -31,8 +31,6 @@ _OFFSETS = np.column_stack([_u.ravel(), _v.ravel()]).astype(np.float32)
 _WEIGHTS = np.exp(-(_OFFSETS**2).sum(axis=1) / (2.0 * _WINDOW**2)).astype(np.float32)
 _WEIGHTS /= _WEIGHTS.sum()
 
-SAMPLES = len(_OFFSETS)
-
 
 class ImagePyramid:
     """An image at several sizes, to be sampled anywhere.

@@ -13,7 +13,6 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -91,8 +90,7 @@ class Checkpoints:
         self._depth_bytes = 0
         self._pool = ThreadPoolExecutor(1, "slamdepth-checkpoint")
         self._writing: Future[None] | None = None
-        self.spent_s = 0.0
-        self.written = 0
+        self._spent_s = 0.0
 
     def go_on_from(self, latest: Latest) -> None:
         """Continue the numbers and the depth file of an earlier process."""
@@ -109,12 +107,11 @@ class Checkpoints:
             return False
         return self._writing is None or self._writing.done()
 
-    def write(self, tracker: Tracker, progress: Callable[[], Progress], *, wait: bool = False) -> None:
-        """Write a checkpoint of a quiet tracker.
+    def write(self, tracker: Tracker, now: Progress) -> None:
+        """Write a checkpoint of a quiet tracker, while the run goes on.
 
         Args:
-            progress: how far the run is.
-            wait: until it is on disk.
+            now: how far the run is.
         """
         if not self._is_on:
             return
@@ -127,7 +124,6 @@ class Checkpoints:
             for frame, stored in keyframes
             if stored is not None and not stored.is_sensor and frame.index not in self._depths
         ]
-        now = progress()
         tree = {
             "tracker": state,
             "steps": steps_state(now.steps),
@@ -143,16 +139,14 @@ class Checkpoints:
         plain, arrays = flattened(tree)
         data = encode_tensors(arrays, {"tree": plain})
         self._writing = self._pool.submit(self._write, data, new, now.done)
-        if wait:
-            self._finish_writing()
         spent_s = time.monotonic() - start_s
-        self.spent_s += spent_s
+        self._spent_s += spent_s
         logger.debug(
             "checkpoint after %d frames: %.0f ms, %.1f MB; %.1f s in all",
             now.done,
             1e3 * spent_s,
             1e-6 * len(data),
-            self.spent_s,
+            self._spent_s,
         )
         self._next_s = time.monotonic() + max(self._every_s, spent_s / _SHARE)
 
@@ -163,7 +157,6 @@ class Checkpoints:
             return
         try:
             writing.result()
-            self.written += 1
         except (OSError, OutputError) as error:
             self._is_on = False
             logger.warning("no more checkpoints are written, the run goes on: %s", error)

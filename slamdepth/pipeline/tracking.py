@@ -135,8 +135,7 @@ def track(
     progress(replace(run.state(run.steps[-1]), stage=RunStage.OPTIMISING))
     if checkpoints is not None and isinstance(tracker, Tracker):
         tracker.complete()
-        if tracker.is_quiet:
-            checkpoints.write(tracker, lambda: run.so_far(is_complete=True))
+        _checkpoint(tracker, checkpoints, run, is_complete=True)
     return _finished(tracker, run)
 
 
@@ -183,7 +182,7 @@ class _Run:
                 f"({self.skipped} of the first {self.done}); the last: {error}"
             )
 
-    def so_far(self, *, is_complete: bool = False) -> Progress:
+    def so_far(self, *, is_complete: bool) -> Progress:
         """For a checkpoint."""
         return Progress(
             tuple(self.steps),
@@ -271,10 +270,10 @@ class _Online:
         self._file.append(result.timestamp_s, result.T_world_camera)
 
 
-def _checkpoint(tracker: Tracker, checkpoints: Checkpoints, run: _Run) -> None:
+def _checkpoint(tracker: Tracker, checkpoints: Checkpoints, run: _Run, *, is_complete: bool = False) -> None:
     """Write a checkpoint, unless a keyframe is between two stages; then one of the next frames will."""
     if tracker.is_quiet:
-        checkpoints.write(tracker, run.so_far)
+        checkpoints.write(tracker, run.so_far(is_complete=is_complete))
 
 
 def _warn(error: ImageDecodeError, count: int) -> None:
