@@ -198,7 +198,7 @@ class Atlas:
                 continue
             agreeing = self._meetings[map_.id].add(meeting)
             log.info("map %d: keyframe %d sees a place of map %d", home.id, keyframe.id, map_.id)
-            if agreeing and self._join(map_, agreeing):
+            if agreeing and self.join(map_, agreeing):
                 return True
         return False
 
@@ -214,14 +214,6 @@ class Atlas:
 
         Args:
             meetings: of keyframes of the active map, which agree.
-
-        Returns:
-            False where they would not reproject as one map.
-        """
-        return self._join(other, meetings)
-
-    def _join(self, other: MapTracker, meetings: list[Meeting]) -> bool:
-        """Make the active map and another one a single map, in the world frame of the older one.
 
         Returns:
             False where they would not reproject as one map; then other keyframes must meet.
