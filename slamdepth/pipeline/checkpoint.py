@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
+import mmap
 import os
 import shutil
 import time
@@ -275,9 +276,13 @@ class SequenceKeyframes:
         self._dataset = dataset
         self._with_depth = with_depth
         path = run_folder / FOLDER / _DEPTH
-        self._bytes = path.read_bytes()[: latest.depth_bytes] if path.is_file() else b""
-        if len(self._bytes) < latest.depth_bytes:
+        size = latest.depth_bytes
+        if (path.stat().st_size if path.is_file() else 0) < size:
             raise DatasetError(f"{path}: is damaged: it is shorter than the checkpoint says")
+        self._bytes: bytes | mmap.mmap = b""
+        if size > 0:  # as much as all the maps that a run keeps out of memory
+            with path.open("rb") as file:
+                self._bytes = mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ)
         self._latest = latest
 
     def read_frame(self, index: int) -> Frame:
