@@ -60,9 +60,7 @@ class GreyImages:
 
         if number not in self._decoded:
             encoded = self._encoded[number]
-            self._decoded[number] = np.asarray(
-                cv2.cvtColor(encoded.decode(encoded.data), cv2.COLOR_RGB2GRAY), np.uint8
-            )
+            self._decoded[number] = np.asarray(cv2.cvtColor(encoded.array(), cv2.COLOR_RGB2GRAY), np.uint8)
             if len(self._decoded) > _OPEN:
                 self._decoded.popitem(last=False)
         self._decoded.move_to_end(number)

@@ -30,6 +30,10 @@ class Encoded:
     data: bytes
     decode: Callable[[bytes], NDArray[Any]]
 
+    def array(self) -> NDArray[Any]:
+        """The array, as far as the encoding keeps it."""
+        return self.decode(self.data)
+
 
 def encode_image(image_rgb: NDArray[np.uint8]) -> Encoded:
     """Encode ``(H, W, 3)`` RGB as a JPEG of quality 95."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from slamdepth.errors import TrackingError
-from slamdepth.mapping.codec import encode_half_precision, encode_image, encode_sensor_depth
+from slamdepth.mapping.codec import Encoded, encode_half_precision, encode_image, encode_sensor_depth
 from slamdepth.mapping.spill_file import SpilledArray, SpillFile
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
@@ -86,15 +86,18 @@ class StoredFrame:
             self.index, self.timestamp_s, self._image.load(), self.camera, depth_m, gravity=self.gravity
         )
 
+    def encoded_image(self) -> Encoded:
+        """The image as a spilled one is written, whether it was spilled or not. Raises as :meth:`load`."""
+        if self._resident is None and self._image is not None:
+            return self._image.encoded()
+        return encode_image(self.load().image_rgb)
+
     def load_as_spilled(self) -> NDArray[np.uint8]:
         """The image ``(H, W, 3)`` as a spilled one is read back, whether it was spilled or not.
 
         What it decides does not depend on how much memory there is. Raises as :meth:`load`.
         """
-        if self._resident is None and self._image is not None:
-            return np.asarray(self._image.load())
-        encoded = encode_image(self.load().image_rgb)
-        return np.asarray(encoded.decode(encoded.data))
+        return np.asarray(self.encoded_image().array())
 
     def _spill(self, file: SpillFile) -> None:
         """Move the images to ``file``."""

@@ -83,4 +83,8 @@ class SpilledArray:
 
     def load(self) -> NDArray[Any]:
         """Read and decode the array."""
-        return self._decode(self._file.read(self._place))
+        return self.encoded().array()
+
+    def encoded(self) -> Encoded:
+        """The array as it was written."""
+        return Encoded(self._file.read(self._place), self._decode)

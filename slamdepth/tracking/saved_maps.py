@@ -16,7 +16,6 @@ from slamdepth.errors import CameraError, DatasetError
 from slamdepth.geometry import backproject
 from slamdepth.loops.edges import loop_arrays, loops_of, odometry_edges
 from slamdepth.loops.vocabulary import Vocabulary
-from slamdepth.mapping.codec import encode_image
 from slamdepth.mapping.keyframe_store import StoredFrame
 from slamdepth.mapping.map_view import MapView
 from slamdepth.mapstore import Map as SavedMap
@@ -140,7 +139,7 @@ def _odometry(map_: MapView) -> dict[str, NDArray[Any]]:
 
 def _images(map_: MapView) -> dict[str, NDArray[Any]]:
     kept = [keyframe for keyframe in map_.keyframes if keyframe.frame.is_kept]
-    files = [encode_image(keyframe.frame.load().image_rgb).data for keyframe in kept]
+    files = [keyframe.frame.encoded_image().data for keyframe in kept]
     return {
         "keyframe": np.array([keyframe.id for keyframe in kept], dtype=np.int64),
         "first_byte": np.concatenate([[0], np.cumsum([len(file) for file in files])]).astype(np.int64),
