@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -159,6 +159,28 @@ class AnchoredPose:
     def restored(state: dict[str, Any], keyframes: Sequence[MapKeyframe]) -> AnchoredPose:
         """What :meth:`state` gave, relative to the keyframe of that id."""
         return AnchoredPose(keyframes[state["keyframe"]], np.array(state["T_camera_keyframe"]), state["unit"])
+
+    @staticmethod
+    def arrays(poses: Sequence[AnchoredPose]) -> dict[str, NDArray[Any]]:
+        """Several poses as arrays."""
+        return {
+            "keyframe": np.array([pose.keyframe.id for pose in poses], dtype=np.int64),
+            "T_camera_keyframe": np.array([pose.T_camera_keyframe for pose in poses]).reshape(-1, 4, 4),
+            "unit": np.array([pose.unit for pose in poses], dtype=np.float64),
+        }
+
+    @staticmethod
+    def of_arrays(arrays: Mapping[str, NDArray[Any]], keyframes: Sequence[MapKeyframe]) -> list[AnchoredPose]:
+        """What :meth:`arrays` was given, relative to the keyframes of these ids."""
+        return [
+            AnchoredPose(keyframes[keyframe], np.array(T_camera_keyframe), unit)
+            for keyframe, T_camera_keyframe, unit in zip(
+                arrays["keyframe"].tolist(),
+                arrays["T_camera_keyframe"],
+                arrays["unit"].tolist(),
+                strict=True,
+            )
+        ]
 
     @property
     def T_camera_world(self) -> Floats:

@@ -143,9 +143,7 @@ class FrameLog:
             "timestamp_s": np.array([p.timestamp_s for p in placed], dtype=np.float64),
             "flags": np.array([(p.is_keyframe, p.follows_motion, p.is_settled) for p in placed], np.bool_),
             "quality": np.array([p.quality for p in placed], dtype=np.float64),
-            "keyframe": np.array([p.keyframe for p in placed], dtype=np.int64),
-            "T_camera_keyframe": np.array([p.pose.T_camera_keyframe for p in placed]).reshape(-1, 4, 4),
-            "unit": np.array([p.pose.unit for p in placed], dtype=np.float64),
+            **AnchoredPose.arrays([p.pose for p in placed]),
             "first": np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
             "landmark": np.concatenate([none.astype(np.int32), *(p.landmark_ids for p in placed)]),
             "px": np.concatenate([none.reshape(0, 2), *(p.px for p in placed)]),
@@ -158,19 +156,17 @@ class FrameLog:
     def restore(self, state: Tree) -> None:
         """Remember what :meth:`state` gave."""
         first = state["first"].tolist()
-        keyframes = self._map.keyframes
+        poses = AnchoredPose.of_arrays(state, self._map.keyframes)
         self._placed = []
         for n, (is_keyframe, follows_motion, is_settled) in enumerate(state["flags"].tolist()):
             at = slice(first[n], first[n + 1])
-            T_camera_keyframe = np.array(state["T_camera_keyframe"][n])
-            keyframe = keyframes[int(state["keyframe"][n])]
             self._placed.append(
                 _Placed(
                     float(state["timestamp_s"][n]),
                     is_keyframe,
                     follows_motion,
                     float(state["quality"][n]),
-                    AnchoredPose(keyframe, T_camera_keyframe, float(state["unit"][n])),
+                    poses[n],
                     np.array(state["landmark"][at]),
                     np.array(state["px"][at]),
                     np.array(state["phase"][at]),

@@ -48,23 +48,14 @@ class PastFrames:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The frames as arrays."""
-        poses = self._poses
         return {
             "timestamp_s": np.array(self._times_s, dtype=np.float64),
             "session": np.array(self._sessions, dtype=np.int64),
-            "keyframe": np.array([pose.keyframe.id for pose in poses], dtype=np.int64),
-            "T_camera_keyframe": np.array([p.T_camera_keyframe for p in poses]).reshape(-1, 4, 4),
-            "unit": np.array([pose.unit for pose in poses], dtype=np.float64),
+            **AnchoredPose.arrays(self._poses),
         }
 
     def restore(self, arrays: Mapping[str, NDArray[Any]], keyframes: Sequence[MapKeyframe]) -> None:
         """Remember what :meth:`arrays` gave."""
-        for timestamp_s, session, keyframe, T, unit in zip(
-            arrays["timestamp_s"].tolist(),
-            arrays["session"].tolist(),
-            arrays["keyframe"].tolist(),
-            arrays["T_camera_keyframe"],
-            arrays["unit"].tolist(),
-            strict=True,
-        ):
-            self.add(timestamp_s, session, AnchoredPose(keyframes[keyframe], np.array(T), unit))
+        self._times_s = arrays["timestamp_s"].tolist()
+        self._sessions = arrays["session"].tolist()
+        self._poses = AnchoredPose.of_arrays(arrays, keyframes)

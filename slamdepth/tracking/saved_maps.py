@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from slamdepth.config import FeatureConfig
 from slamdepth.errors import CameraError, DatasetError
 from slamdepth.geometry import backproject
-from slamdepth.loops.edges import loop_arrays, loops_of, odometry_edges
+from slamdepth.loops.edges import edge_arrays, loop_arrays, loops_of, odometry_edges
 from slamdepth.loops.vocabulary import Vocabulary
 from slamdepth.mapping.keyframe_store import StoredFrame
 from slamdepth.mapping.map_view import MapView
@@ -129,12 +129,8 @@ def _saved(
 
 
 def _odometry(map_: MapView) -> dict[str, NDArray[Any]]:
-    edges = odometry_edges(map_, map_.covisibility())
-    return {
-        "odometry_keyframes": np.array([(e.i, e.j) for e in edges], dtype=np.int64).reshape(-1, 2),
-        "odometry_T_i_j": np.array([e.T_i_j for e in edges], dtype=np.float64).reshape(-1, 4, 4),
-        "odometry_sigmas": np.array([e.sigmas for e in edges], dtype=np.float64).reshape(-1, 3),
-    }
+    arrays = edge_arrays(odometry_edges(map_, map_.covisibility()))
+    return {f"odometry_{name}": arrays[name] for name in ("keyframes", "T_i_j", "sigmas")}
 
 
 def _images(map_: MapView) -> dict[str, NDArray[Any]]:
