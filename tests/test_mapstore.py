@@ -94,6 +94,7 @@ def test_another_version_is_refused_in_one_line(saved: Map, tmp_path: Path) -> N
     ("text", "says"),
     [
         ("{", "is damaged"),
+        ("[" * 100_000, "is damaged"),
         ("[]", "is no map of slamdepth"),
         ('{"format": "slamdepth map", "version": 1}', "it lists no files"),
         ('{"format": "slamdepth map", "version": 1, "files": {}}', "is not listed"),

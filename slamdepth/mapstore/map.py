@@ -255,7 +255,7 @@ def _read_about(folder: Path) -> dict[str, Any]:
         about = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:  # RecursionError: too deeply nested
         raise DatasetError(f"{path}: is damaged: {error}") from error
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise DatasetError(f"{path}: is no map of slamdepth")

@@ -258,7 +258,7 @@ def read_latest(run_folder: Path) -> Latest | None:
         return Latest(
             tree["tracker"], progress, about["number"], depths, about["depth_bytes"], tree["recent"]
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(f"{path}: is damaged: {error}; start the run again with --overwrite") from error
 
 
@@ -336,7 +336,7 @@ def read_begun(run_folder: Path) -> Tree | None:
         about = json.loads(path.read_text(encoding="utf-8"))
         if about["version"] != VERSION:
             raise DatasetError(f"{path}: has version {about['version']}, and this slamdepth knows {VERSION}")
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(f"{path}: is damaged: {error}") from error
     return dict(about)
 
