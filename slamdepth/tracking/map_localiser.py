@@ -21,7 +21,7 @@ from slamdepth.thread_limits import single_threaded
 from slamdepth.tracking.frame_log import check_frame
 from slamdepth.tracking.map_parts import RunParts
 from slamdepth.tracking.map_tracker import MapTracker, Placed
-from slamdepth.tracking.saved_maps import load_map
+from slamdepth.tracking.saved_maps import load_map, with_features_of
 from slamdepth.tracking.status import STATUS
 from slamdepth.tracking.wide_features import WideFeatures
 from slamdepth.tracking.workers import DepthWorker, Workers
@@ -52,10 +52,7 @@ class MapLocaliser:
 
     def __init__(self, map: Map, camera: Camera | None = None, config: Config | None = None) -> None:
         self.camera = camera or map.camera
-        config = config or Config()
-        self.config = config = Config.from_dict(
-            {**config.model_dump(), "features": dict(map.features)}, origin="the map"
-        )
+        self.config = config = with_features_of(map, config)
         if len(map) == 0:
             raise DatasetError("the map has no keyframes")
         self._prepare = Preparation(self.camera, config.features)

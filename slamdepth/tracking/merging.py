@@ -19,7 +19,7 @@ from slamdepth.tracking.atlas import Atlas
 from slamdepth.tracking.finish import optimise_map
 from slamdepth.tracking.map_parts import RunParts
 from slamdepth.tracking.map_tracker import MapTracker
-from slamdepth.tracking.saved_maps import load_map, save_merged
+from slamdepth.tracking.saved_maps import load_map, save_merged, with_features_of
 from slamdepth.tracking.wide_features import WideFeatures
 from slamdepth.tracking.workers import DepthWorker, Workers
 
@@ -61,9 +61,7 @@ def merge_maps(first: Map, second: Map, config: Config | None = None) -> Merged 
     """
     if first.is_measured != second.is_measured:
         raise DatasetError("one map was made with a sensor's depth, the other one with predicted depth")
-    config = Config.from_dict(
-        {**(config or Config()).model_dump(), "features": dict(first.features)}, origin="the map"
-    )
+    config = with_features_of(first, config)
     watch = Stopwatch()
     workers = Workers(DepthWorker(SensorDepth(), watch))
     try:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slamdepth.config import FeatureConfig
+from slamdepth.config import Config, FeatureConfig
 from slamdepth.errors import CameraError, DatasetError
 from slamdepth.geometry import backproject
 from slamdepth.loops.edges import edge_arrays, loop_arrays, loops_of, odometry_edges
@@ -185,6 +185,16 @@ def load_map(saved: SavedMap, into: MapParts, camera: Camera, features: FeatureC
         into.shutter.go_on_from(*saved.shutter, first_of_run)
     into.past.restore(saved.groups["frames"], into.map.keyframes)
     into.is_loaded = True
+
+
+def with_features_of(saved: SavedMap, config: Config | None) -> Config:
+    """The settings ``config`` or the defaults, with features like those of the map.
+
+    Raises:
+        ConfigError: the map's are not known here.
+    """
+    asked = (config or Config()).model_dump()
+    return Config.from_dict({**asked, "features": dict(saved.features)}, origin="the map")
 
 
 def check_features(saved: SavedMap, features: FeatureConfig) -> None:
