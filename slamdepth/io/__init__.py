@@ -17,7 +17,7 @@ from slamdepth.io.images import (
     write_npy,
     write_png,
 )
-from slamdepth.io.outputs import writable, writable_file
+from slamdepth.io.outputs import results_folder, writable, writable_file
 from slamdepth.io.ply import encode_ply, write_point_cloud
 from slamdepth.io.text import parse_float, read_json, read_lines, replacing, write_json, write_text
 from slamdepth.io.trajectory import TrajectoryWriter, format_timestamp, write_tum_trajectory
@@ -40,6 +40,7 @@ __all__ = [
     "read_trajectory_pair",
     "read_tum_trajectory",
     "replacing",
+    "results_folder",
     "sha256_of",
     "writable",
     "writable_file",

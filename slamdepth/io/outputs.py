@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from slamdepth.errors import OutputError
@@ -23,6 +24,31 @@ def writable(path: Path) -> Path:
     if not os.access(place, os.W_OK | os.X_OK):
         raise OutputError(f"{path}: cannot be written: no permission to write to {place}")
     return path
+
+
+def results_folder(folder: Path, is_ours: Callable[[Path], bool], what: str, *, overwrite: bool) -> Path:
+    """``folder`` with ``~`` expanded, if results can be written there without replacing anything else.
+
+    Args:
+        is_ours: whether a folder with something in it holds earlier results of the same kind.
+        what: names these in messages, such as "run".
+        overwrite: they may be replaced.
+
+    Raises:
+        OutputError: it is a file, holds something else or earlier results, or cannot be read or written.
+    """
+    folder = folder.expanduser()
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise OutputError(f"{folder}: is a file; name a folder for the results")
+        is_empty = not (folder.is_dir() and any(folder.iterdir()))
+        if not is_empty and not is_ours(folder):
+            raise OutputError(f"{folder}: is not empty and holds no earlier {what}; name a new folder")
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be read: {error.strerror or error}") from error
+    if not is_empty and not overwrite:
+        raise OutputError(f"{folder}: holds an earlier {what}; name another folder or add --overwrite")
+    return writable(folder)
 
 
 def writable_file(path: Path, ending: str) -> Path:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from slamdepth.errors import OutputError
 from slamdepth.export import is_export
-from slamdepth.io import writable, write_text
+from slamdepth.io import results_folder, writable, write_text
 from slamdepth.mapstore import remove_map
 from slamdepth.pipeline import checkpoint
 
@@ -91,19 +91,8 @@ class RunFolder:
                 path = Path("runs") / f"{stem}-{number}"
                 number += 1
             return cls(writable(path))
-        path = Path(output).expanduser()
-        try:
-            if path.exists() and not path.is_dir():
-                raise OutputError(f"{path}: is a file; name a folder for the results")
-            if not (path.is_dir() and any(path.iterdir())):
-                return cls(writable(path))
-            if not is_run(path):
-                raise OutputError(f"{path}: is not empty and holds no earlier run; name a new folder")
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from error
-        if not overwrite:
-            raise OutputError(f"{path}: holds an earlier run; name another folder or add --overwrite")
-        return cls(writable(path), replaces=True)
+        path = results_folder(Path(output), is_run, "run", overwrite=overwrite)
+        return cls(path, replaces=path.is_dir() and any(path.iterdir()))
 
     def check_keeps(self, paths: Iterable[Path]) -> None:
         """Refuse to replace an earlier run whose map or export this run reads.

@@ -21,8 +21,8 @@ from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.image_files import IMAGE_ENDINGS
 from slamdepth.datasets.readers.live import LiveReader
 from slamdepth.datasets.virtual_view import as_pinhole
-from slamdepth.errors import CameraError, DatasetError, ImageDecodeError, OutputError
-from slamdepth.io import write_json, write_text, write_tum_trajectory
+from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
+from slamdepth.io import results_folder, writable, write_json, write_text, write_tum_trajectory
 from slamdepth.io.images import read_image_rgb
 from slamdepth.io.trajectory import format_timestamp
 from slamdepth.mapstore import Map
@@ -257,17 +257,9 @@ def plan_folder(output: Path | None, name: str, *, overwrite: bool) -> Path:
     Raises:
         OutputError: it is a file, cannot be written, or holds something else than earlier results.
     """
-    from slamdepth.io import writable
-
     if output is None:
         safe = re.sub(r"[^\w.-]+", "-", name)  # a pattern has stars
         return writable(Path("runs") / f"{safe}-localized-{time.strftime('%Y%m%d-%H%M%S')}")
-    path = output.expanduser()
-    if path.exists() and not path.is_dir():
-        raise OutputError(f"{path}: is a file; name a folder for the results")
-    if path.is_dir() and any(path.iterdir()):
-        if not (path / FIGURES).is_file():
-            raise OutputError(f"{path}: is not empty and holds no earlier localisation; name a new folder")
-        if not overwrite:
-            raise OutputError(f"{path}: holds an earlier localisation; name another or add --overwrite")
-    return writable(path)
+    return results_folder(
+        output, lambda path: (path / FIGURES).is_file(), "localisation", overwrite=overwrite
+    )

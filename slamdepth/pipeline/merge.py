@@ -11,8 +11,8 @@ from typing import Any
 
 from slamdepth._version import __version__
 from slamdepth.config import Config
-from slamdepth.errors import ConfigError, OutputError
-from slamdepth.io import writable, write_json, write_tum_trajectory
+from slamdepth.errors import ConfigError
+from slamdepth.io import results_folder, write_json, write_tum_trajectory
 from slamdepth.mapstore import Map
 from slamdepth.pipeline.folder import MAP, make_folder
 from slamdepth.tracking.merging import merge_all
@@ -91,12 +91,4 @@ def plan_folder(output: Path, *, overwrite: bool) -> Path:
     Raises:
         OutputError: it is a file, cannot be written, or holds something else than earlier results.
     """
-    path = output.expanduser()
-    if path.exists() and not path.is_dir():
-        raise OutputError(f"{path}: is a file; name a folder for the results")
-    if path.is_dir() and any(path.iterdir()):
-        if not (path / _FIGURES).is_file():
-            raise OutputError(f"{path}: is not empty and holds no merged map; name a new folder")
-        if not overwrite:
-            raise OutputError(f"{path}: holds a merged map; name another folder or add --overwrite")
-    return writable(path)
+    return results_folder(output, lambda path: (path / _FIGURES).is_file(), "merged map", overwrite=overwrite)
