@@ -12,7 +12,7 @@ from pathlib import Path
 from slamdepth.errors import InputError, OutputError
 from slamdepth.export.images import ImageMode
 from slamdepth.export.registry import ExportRequest, export_format
-from slamdepth.io import writable, write_text
+from slamdepth.io import results_folder, write_text
 
 README = "README.txt"
 _MARK = "An export of slamdepth"
@@ -63,15 +63,7 @@ def check_place(folder: Path, *, overwrite: bool = False) -> Path:
     Raises:
         OutputError: it is a file, holds something already, or cannot be written.
     """
-    folder = folder.expanduser()
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; name a folder for the export")
-    if folder.is_dir() and any(folder.iterdir()):
-        if not is_export(folder):
-            raise OutputError(f"{folder}: is not empty and holds no earlier export; name a new folder")
-        if not overwrite:
-            raise OutputError(f"{folder}: holds an earlier export; name another folder or add --overwrite")
-    return writable(folder)
+    return results_folder(folder, is_export, "export", overwrite=overwrite)
 
 
 def is_export(folder: Path) -> bool:
