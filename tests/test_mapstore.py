@@ -163,6 +163,17 @@ def test_saving_replaces_a_map_and_nothing_else(saved: Map, tmp_path: Path) -> N
     assert [path.name for path in other.iterdir()] == ["one.jpg"]
 
 
+def test_a_link_to_a_map_is_replaced_and_what_it_leads_to_stays(saved: Map, tmp_path: Path) -> None:
+    saved.save(tmp_path / "there" / "map")
+    (tmp_path / "here").mkdir()
+    link = tmp_path / "here" / "map"
+    link.symlink_to(tmp_path / "there" / "map")
+    saved.save(link)
+    assert [path.name for path in link.parent.iterdir()] == ["map"]
+    assert not link.is_symlink()
+    assert len(Map.load(tmp_path / "there")) == len(Map.load(link)) == len(saved)
+
+
 def test_a_place_that_cannot_be_written_keeps_what_was_there(saved: Map, tmp_path: Path) -> None:
     saved.save(tmp_path / "map")
     before = (tmp_path / "map" / "map.json").read_bytes()

@@ -3,16 +3,13 @@
 
 from __future__ import annotations
 
-import os
-import secrets
-import shutil
-from contextlib import suppress
 from pathlib import Path
 
-from slamdepth.errors import InputError, OutputError
+from slamdepth.errors import InputError
 from slamdepth.export.images import ImageMode
 from slamdepth.export.registry import ExportRequest, export_format
 from slamdepth.io import results_folder, write_text
+from slamdepth.io.text import replacing_folder
 
 README = "README.txt"
 _MARK = "An export of slamdepth"
@@ -38,22 +35,10 @@ def write_export(request: ExportRequest, name: str, folder: Path, *, overwrite: 
             "this run has no keyframe to export, since the map that it went on from had all it needed: "
             "'slamdepth export RUN --every-frame' takes its frames"
         )
-    folder = check_place(folder, overwrite=overwrite)
-    folder = folder.absolute()
-    partial = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.partial")
-    try:
-        try:
-            partial.mkdir(parents=True)
-            lines = kind.write(request, partial)
-            write_text(partial / README, _readme(request, name, kind.about, kind.has_images, lines))
-            if is_export(folder):
-                shutil.rmtree(folder)
-            os.replace(partial, folder)  # an empty folder may be there
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            shutil.rmtree(partial)
+    folder = check_place(folder, overwrite=overwrite).absolute()
+    with replacing_folder(folder) as partial:
+        lines = kind.write(request, partial)
+        write_text(partial / README, _readme(request, name, kind.about, kind.has_images, lines))
     return folder
 
 

@@ -8,6 +8,7 @@ import math
 import os
 import re
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from enum import Enum
@@ -92,6 +93,35 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # such as a folder that is no folder: that error is on its way
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(folder: str | Path) -> Iterator[Path]:
+    """A new folder beside ``folder``, which takes its place when the block succeeds.
+
+    Raises:
+        OutputError: ``folder`` cannot be written; what was there stays, and nothing else is left behind.
+    """
+    place = Path(folder).absolute()
+    partial = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
+    before = partial.with_suffix(".before")
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        if place.exists():
+            os.replace(place, before)
+        os.replace(partial, place)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        with suppress(OSError):
+            if not place.exists():
+                os.replace(before, place)
+            elif before.is_symlink():
+                before.unlink()
+            else:
+                shutil.rmtree(before, ignore_errors=True)
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -4,11 +4,7 @@
 from __future__ import annotations
 
 import json
-import os
-import secrets
-import shutil
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +15,7 @@ from slamdepth.errors import CameraError, DatasetError, OutputError
 from slamdepth.geometry import invert
 from slamdepth.io.outputs import writable
 from slamdepth.io.tensors import decode_tensors, encode_tensors, read_checked, write_bytes
-from slamdepth.io.text import write_json
+from slamdepth.io.text import replacing_folder, write_json
 from slamdepth.mapstore.format import ABOUT, ARRAYS, FORMAT, OPTIONAL, VERSION, check_arrays, file_of
 from slamdepth.types import Camera, Trajectory
 
@@ -161,22 +157,8 @@ class Map:
         writable(folder)
         if folder.exists() and not is_map(folder):
             raise OutputError(f"{folder}: is there already and no map; name another folder")
-        partial = folder.absolute().with_name(f".{folder.name}.{secrets.token_hex(4)}.partial")
-        before = partial.with_suffix(".before")
-        try:
-            partial.mkdir(parents=True)
+        with replacing_folder(folder) as partial:
             self._write(partial)
-            if folder.exists():
-                os.replace(folder, before)
-            os.replace(partial, folder)
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
-        finally:
-            if before.exists() and not folder.exists():
-                with suppress(OSError):
-                    os.replace(before, folder)
-            for left in (partial, before):
-                shutil.rmtree(left, ignore_errors=True)
 
     def _write(self, folder: Path) -> None:
         files = {}
