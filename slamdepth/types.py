@@ -358,6 +358,11 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.timestamps_s)
 
+    @classmethod
+    def empty(cls) -> Trajectory:
+        """No pose at all."""
+        return cls(np.zeros(0), np.zeros((0, 4, 4)))
+
 
 @dataclass(frozen=True)
 class RunStatistics:

@@ -72,6 +72,21 @@ def test_a_run_of_an_older_version_has_path_and_keyframes_but_no_images(
     assert "made by an older slamdepth" in run.notes[0]
 
 
+def test_a_run_that_placed_no_frame_is_read_compared_and_has_no_video(
+    run_folder: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(run_folder, tmp_path / "lost")
+    write_tum_trajectory(tmp_path / "lost" / "trajectory.txt", Trajectory.empty())
+    lost = read_run(tmp_path / "lost")
+    assert len(lost.scene.maps[0].path) == 0
+    found = compare_runs([read_run(run_folder), lost])
+    assert found.to_first == (None, None)
+    assert "too little in common" in found.notes[0]
+    assert build_compare_html(found).count("<svg") == 3
+    with pytest.raises(DatasetError, match="no such mesh"):
+        render_flight(FlightQuestion(tmp_path / "lost", tmp_path / "x.mp4"), lambda done, total: None)
+
+
 def test_what_is_no_finished_run_is_refused_in_one_line(run_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no such run folder"):
         read_run(tmp_path / "absent")

@@ -30,14 +30,13 @@ from slamdepth.export import (
 from slamdepth.export.registry import Progress
 from slamdepth.export.write import check_place
 from slamdepth.io import read_tum_trajectory
-from slamdepth.io.text import read_commented_lines
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapstore import Map
 from slamdepth.mapstore.map import is_map
 from slamdepth.pipeline.camera import use_view
-from slamdepth.pipeline.folder import EXPORTS, MAP, MAPS, RunFolder, is_run, recorded_arguments
+from slamdepth.pipeline.folder import EXPORTS, MAP, RunFolder, is_run, recorded_arguments
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
-from slamdepth.types import Trajectory
+from slamdepth.report.saved_run import map_folder, read_poses
 
 logger = logging.getLogger(__name__)
 
@@ -173,12 +172,12 @@ def scene_of_folder(folder: Path, map_number: int = 1, *, with_tracks: bool = Tr
     Raises:
         InputError: a file is missing or damaged, or there is no such map.
     """
-    place = folder if map_number == 1 else folder / MAPS / str(map_number)
+    place = map_folder(folder, map_number)
     if map_number < 1 or not place.is_dir():
         raise InputError(f"{folder}: has no map {map_number}")
     report = _report(folder)
     trajectory, _ = read_tum_trajectory(place / "trajectory.txt")
-    keyframes = _keyframes(place / "keyframes.txt")
+    keyframes = read_poses(place / "keyframes.txt")  # none where the run added none to a map
     maps = report.get("maps") or [{}]
     scale = (maps[map_number - 1] if map_number <= len(maps) else {}).get("scale") or {}
     readout_ms = (report.get("rolling_shutter") or {}).get("readout_ms")
@@ -232,13 +231,6 @@ def with_saved_map(scene: ExportScene, saved: Map) -> ExportScene:
         readout_s=saved.shutter[0],
         gravity_w=gravity.in_world(),
     )
-
-
-def _keyframes(path: Path) -> Trajectory:
-    """The keyframes of a run; none where it went on from a map that had all it needed."""
-    if all(line.startswith("#") for _, line in read_commented_lines(path)):
-        return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-    return read_tum_trajectory(path)[0]
 
 
 def _report(folder: Path) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from slamdepth.export import is_export
 from slamdepth.io import results_folder, writable, write_text
 from slamdepth.mapstore import remove_map
 from slamdepth.pipeline import checkpoint
+from slamdepth.report.saved_run import map_folder
 
 FILES = {
     "trajectory.txt": "every frame placed in the largest map, after optimisation (TUM, camera to world)",
@@ -149,7 +150,7 @@ class RunFolder:
         Raises:
             OutputError: it cannot be written.
         """
-        folder = self.path if number == 1 else self.path / MAPS / str(number)
+        folder = map_folder(self.path, number)
         make_folder(folder)
         return folder
 

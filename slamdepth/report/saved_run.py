@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from slamdepth.errors import DatasetError
-from slamdepth.io import read_tum_trajectory
+from slamdepth.io import read_lines, read_tum_trajectory
 from slamdepth.mapping.mesh import Mesh
 from slamdepth.open3d_loader import import_open3d
 from slamdepth.report.scene.file import SCENE_FILE, read_scene
@@ -110,18 +110,23 @@ def read_mesh(path: Path) -> Mesh:
     return Mesh(vertices, np.asarray(read.triangles, np.int32), colors)
 
 
+def read_poses(path: Path) -> Trajectory:
+    """Read ``trajectory.txt`` or ``keyframes.txt`` of a run, which hold no pose where the run has none.
+
+    Raises:
+        DatasetError: the file is missing or damaged.
+    """
+    return read_tum_trajectory(path)[0] if read_lines(path) else Trajectory.empty()
+
+
 def _path_of(folder: Path, number: int) -> Trajectory:
-    return _trajectory(map_folder(folder, number) / "trajectory.txt")
+    return _poses_if_any(map_folder(folder, number) / "trajectory.txt")
 
 
-def _trajectory(path: Path) -> Trajectory:
-    return read_tum_trajectory(path)[0] if path.is_file() and path.stat().st_size else _nothing()
-
-
-def _nothing() -> Trajectory:
-    return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+def _poses_if_any(path: Path) -> Trajectory:
+    return read_poses(path) if path.is_file() else Trajectory.empty()
 
 
 def _bare_map(folder: Path, number: int) -> SceneMap:
-    keyframes = _trajectory(map_folder(folder, number) / "keyframes.txt")
+    keyframes = _poses_if_any(map_folder(folder, number) / "keyframes.txt")
     return SceneMap(number, _path_of(folder, number), np.arange(len(keyframes)), keyframes)

@@ -61,7 +61,9 @@ def paths_plot(found: Comparison) -> str | None:
 def errors_plot(found: Comparison) -> str | None:
     """Distance of each pose from the ground truth over time; None where no run has one."""
     curves = [
-        (n, *_error(one)) for n, run in enumerate(found.runs) if (one := run.scene.maps[0]).truth is not None
+        (n, *_error(one))
+        for n, run in enumerate(found.runs)
+        if (one := run.scene.maps[0]).truth is not None and len(one.path)
     ]
     if not curves:
         return None
