@@ -78,6 +78,7 @@ def test_the_file_gives_back_the_scene_without_mesh_and_path(tmp_path: Path) -> 
     assert scene is not None
     write_scene(tmp_path / "scene.safetensors", scene)
     back = read_scene(tmp_path / "scene.safetensors")
+    assert back.camera == scene.camera
     assert all(one.mesh is None and len(one.path) == 0 for one in back.maps)
     filled = zip(back.maps, scene.maps, strict=True)
     back = replace(back, maps=tuple(replace(one, path=other.path) for one, other in filled))
@@ -105,6 +106,13 @@ def test_a_damaged_or_foreign_or_newer_file_is_refused_by_name(tmp_path: Path) -
         {"a": np.zeros(1)}, path, {"slamdepth": json.dumps({"format": "slamdepth scene", "version": 9})}
     )
     with pytest.raises(DatasetError, match="has version 9"):
+        read_scene(path)
+    save_file({"a": np.zeros(1)}, path, {"slamdepth": "[]"})
+    with pytest.raises(DatasetError, match="is no scene"):
+        read_scene(path)
+    scene = room_scene()
+    write_scene(path, replace(scene, maps=(replace(scene.maps[0], loops=np.array([[0, 6]])),)))
+    with pytest.raises(DatasetError, match=r"scene\.safetensors: cannot be read: 1/loops names a keyframe"):
         read_scene(path)
 
 

@@ -19,21 +19,27 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def encode_tensors(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any] | None = None) -> bytes:
+def encode_tensors(
+    arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any] | None = None, key: str = "about"
+) -> bytes:
     """Arrays of one or more dimensions as the bytes of a safetensors file.
 
     Args:
         about: what JSON can hold; stored in the header.
+        key: of the header's entry that holds it.
     """
     from safetensors.numpy import save
 
     contiguous = {name: np.ascontiguousarray(array) for name, array in sorted(arrays.items())}
-    text = None if about is None else {"about": json.dumps(about, sort_keys=True)}
+    text = None if about is None else {key: json.dumps(about, sort_keys=True)}
     return bytes(save(contiguous, metadata=text))
 
 
-def decode_tensors(data: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def decode_tensors(data: bytes, key: str = "about") -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """What :func:`encode_tensors` was given; the arrays may be written.
+
+    Args:
+        key: as it was given; without such an entry, nothing is known about the arrays.
 
     Raises:
         ValueError: the bytes are no such file.
@@ -44,7 +50,7 @@ def decode_tensors(data: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
     try:
         arrays = load(data)
         length = int.from_bytes(data[:8], "little")
-        text = json.loads(data[8 : 8 + length]).get("__metadata__", {}).get("about")
+        text = json.loads(data[8 : 8 + length]).get("__metadata__", {}).get(key)
         about = {} if text is None else json.loads(text)
     except (SafetensorError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise ValueError(f"no safetensors file: {error}") from error

@@ -13,15 +13,14 @@ One file of safetensors. Its metadata has one entry, ``slamdepth``, a JSON text 
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slamdepth.errors import DatasetError, SlamdepthError
-from slamdepth.io import replacing
+from slamdepth.errors import CameraError, DatasetError
+from slamdepth.io.tensors import decode_tensors, encode_tensors, write_bytes
 from slamdepth.report.scene.model import Scene, SceneMap, Thumbnail
 from slamdepth.types import Camera, Trajectory
 
@@ -39,11 +38,9 @@ def write_scene(path: Path, scene: Scene) -> None:
     Raises:
         OutputError: ``path`` cannot be written.
     """
-    from safetensors.numpy import save
-
     tensors: dict[str, NDArray[Any]] = {}
     for one in scene.maps:
-        tensors |= {f"{one.number}/{name}": np.ascontiguousarray(a) for name, a in _tensors(one).items()}
+        tensors |= {f"{one.number}/{name}": array for name, array in _tensors(one).items()}
     about = {
         "format": _FORMAT,
         "version": _VERSION,
@@ -52,9 +49,7 @@ def write_scene(path: Path, scene: Scene) -> None:
         "far_m": scene.far_m,
         "camera": None if scene.camera is None else asdict(scene.camera),
     }
-    data = save(tensors, {_KEY: json.dumps(about, sort_keys=True)})
-    with replacing(path) as partial:
-        partial.write_bytes(data)
+    write_bytes(path, encode_tensors(tensors, about, _KEY))
 
 
 def read_scene(path: Path) -> Scene:
@@ -63,30 +58,30 @@ def read_scene(path: Path) -> Scene:
     Raises:
         DatasetError: it cannot be read, is damaged, or is of a newer version.
     """
-    from safetensors import SafetensorError, safe_open
-
     try:
-        with safe_open(path, framework="numpy") as file:
-            about = json.loads((file.metadata() or {}).get(_KEY, "{}"))
-            if about.get("format") != _FORMAT:
-                raise DatasetError(f"{path}: is no scene of a run")
-            if about["version"] != _VERSION:
-                raise DatasetError(
-                    f"{path}: has version {about['version']}, this slamdepth reads {_VERSION}: run it again"
-                )
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        camera = None if about["camera"] is None else Camera(**about["camera"])
+        tensors, about = decode_tensors(path.read_bytes(), _KEY)
+        if not isinstance(about, dict) or about.get("format") != _FORMAT:
+            raise DatasetError(f"{path}: is no scene of a run")
+        if about["version"] != _VERSION:
+            raise DatasetError(
+                f"{path}: has version {about['version']}, this slamdepth reads {_VERSION}: run it again"
+            )
+        camera = None if about["camera"] is None else _camera(about["camera"])
         maps = tuple(_map(tensors, number) for number in range(1, about["maps"] + 1))
         return Scene(maps, camera, float(about["near_m"]), float(about["far_m"]))
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, IndexError) as error:
+    except (OSError, KeyError, TypeError, ValueError, IndexError) as error:
         raise DatasetError(f"{path}: cannot be read: {error}") from error
-    except SlamdepthError as error:
-        raise error if isinstance(error, DatasetError) else DatasetError(f"{path}: {error}") from error
+    except CameraError as error:
+        raise DatasetError(f"{path}: {error}") from error
+
+
+def _camera(about: dict[str, Any]) -> Camera:
+    return Camera(**{**about, "distortion": tuple(about["distortion"])})
 
 
 def _tensors(one: SceneMap) -> dict[str, NDArray[Any]]:
     images, depths = ([getattr(t, name) for t in one.thumbnails] for name in ("image", "depth"))
-    truth = one.truth or Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    truth = one.truth or Trajectory.empty()
     return {
         "keyframe_ids": one.keyframe_ids,
         "keyframe_times_s": one.keyframes.timestamps_s,
@@ -108,6 +103,10 @@ def _map(tensors: dict[str, NDArray[Any]], number: int) -> SceneMap:
     def of(name: str) -> NDArray[Any]:
         return tensors[f"{number}/{name}"]
 
+    keyframes = Trajectory(of("keyframe_times_s"), of("keyframe_poses"))
+    for name in ("loops", "thumbnail_rows"):
+        if (rows := of(name)).size and not 0 <= rows.min() <= rows.max() < len(keyframes):
+            raise ValueError(f"{number}/{name} names a keyframe that is not there")
     images = _pieces(of("images"), of("image_ends"))
     depths = _pieces(of("depths"), of("depth_ends"))
     truth_m = of("truth_m")
@@ -115,9 +114,9 @@ def _map(tensors: dict[str, NDArray[Any]], number: int) -> SceneMap:
     poses[:, :3, 3] = truth_m
     return SceneMap(
         number=number,
-        path=Trajectory(np.zeros(0), np.zeros((0, 4, 4))),
+        path=Trajectory.empty(),
         keyframe_ids=of("keyframe_ids"),
-        keyframes=Trajectory(of("keyframe_times_s"), of("keyframe_poses")),
+        keyframes=keyframes,
         loops=of("loops"),
         points_m=of("points_m").astype(np.float64),
         truth=Trajectory(of("truth_times_s"), poses) if len(truth_m) else None,
