@@ -36,11 +36,8 @@ from slamdepth.cli import (
     view,
     weights,
 )
-from slamdepth.cli.console import QuietOption, VerboseOption, error_console, is_verbose
+from slamdepth.cli.console import QuietOption, UsageProblem, VerboseOption, error_console, is_verbose
 from slamdepth.errors import SlamdepthError
-
-# typer uses click before 0.26 and its own copy of click since: the class is looked up, not imported.
-_UsageProblem: type[Any] = next(cls for cls in typer.BadParameter.__mro__ if cls.__name__ == "ClickException")
 
 app = typer.Typer(
     name="slamdepth",
@@ -105,7 +102,7 @@ def main() -> NoReturn:
     except SlamdepthError as error:
         _print_error(str(error))
         code = error.exit_code
-    except _UsageProblem as problem:
+    except UsageProblem as problem:
         # typer shows the help itself where no command is given; its message is then empty.
         if message := problem.format_message():
             context = getattr(problem, "ctx", None)

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slamdepth.cli.console import QuietOption, VerboseOption, console, error_console, print_places
+from slamdepth.cli.console import (
+    QuietOption,
+    UsageProblem,
+    VerboseOption,
+    console,
+    error_console,
+    print_places,
+)
 from slamdepth.cli.progress import JobBar
 from slamdepth.cli.signals import Interrupted, stop_on_signals
 
@@ -113,7 +120,7 @@ def _check_options(recordings: Sequence[Recording], common: tuple[str, ...]) -> 
             _run_command().make_context("run", ["SEQ", *words])
         except typer.Exit as leaving:  # --help
             raise ConfigError("the options of a run must not ask for help") from leaving
-        except _usage_problem() as problem:
+        except UsageProblem as problem:
             raise ConfigError(f"options of a run: {problem.format_message()}") from problem
 
 
@@ -123,10 +130,6 @@ def _run_command() -> Any:
     alone = typer.Typer(add_completion=False)
     alone.command("run")(run_command)
     return typer.main.get_command(alone)
-
-
-def _usage_problem() -> type[Any]:
-    return next(cls for cls in typer.BadParameter.__mro__ if cls.__name__ == "ClickException")
 
 
 def _show(bar: JobBar, state: BatchProgress) -> None:
