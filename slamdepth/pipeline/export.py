@@ -19,7 +19,6 @@ from slamdepth.datasets.readers.live import LiveReader
 from slamdepth.depth.gravity_consensus import GravityConsensus
 from slamdepth.errors import ConfigError, DatasetError, InputError, SlamdepthError
 from slamdepth.export import (
-    FORMATS,
     ExportRequest,
     ExportScene,
     ImageMode,
@@ -150,11 +149,6 @@ def image_mode(name: str) -> ImageMode:
     except ValueError as error:
         known = ", ".join(mode.value for mode in ImageMode)
         raise ConfigError(f"images must be one of {known}, got '{name}'") from error
-
-
-def format_table() -> list[tuple[str, str]]:
-    """Every format, with what it writes."""
-    return [(name, FORMATS.get(name).about) for name in FORMATS.names()]
 
 
 def default_place(run: Path, name: str, map_number: int) -> Path:
