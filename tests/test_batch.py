@@ -209,6 +209,11 @@ def test_recordings_are_found(tmp_path: Path) -> None:
     assert [one.path for one in found[3:]] == ["rtsp://cam/1", "camera:0"]
 
 
+def test_a_question_mark_in_an_address_is_no_pattern() -> None:
+    address = "http://me:secret@cam.lan/video.txt?key=secret"
+    assert find_recordings([address]) == (Recording(address),)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "says"),
     [

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from slamdepth.datasets.readers.live import LiveReader
 from slamdepth.errors import DatasetError
 from slamdepth.io import read_lines
 
@@ -43,7 +44,9 @@ def find_recordings(inputs: Sequence[str]) -> tuple[Recording, ...]:
     found: list[Recording] = []
     for text in inputs:
         path = Path(text).expanduser()
-        if path.suffix.lower() == LIST_ENDING and not path.is_dir():
+        if _is_live(text):
+            found.append(Recording(text))
+        elif path.suffix.lower() == LIST_ENDING and not path.is_dir():
             found += _of_list(path)
         elif any(character in text for character in _PATTERN) and not path.exists():
             matches = sorted(glob.glob(str(path)))
@@ -51,15 +54,15 @@ def find_recordings(inputs: Sequence[str]) -> tuple[Recording, ...]:
                 raise DatasetError(f"{text}: matches no file and no folder")
             found += [Recording(match) for match in matches]
         else:
-            found.append(Recording(text if _is_address(text) else str(path)))
+            found.append(Recording(str(path)))
     if not found:
         raise DatasetError("no recordings: name videos, folders, patterns, or a .txt list of them")
     return tuple(dict.fromkeys(found))
 
 
-def _is_address(text: str) -> bool:
+def _is_live(text: str) -> bool:
     """Whether a recording is a live source rather than a file."""
-    return "://" in text or text.startswith("camera:")
+    return LiveReader().matches(Path(text))
 
 
 def _of_list(path: Path) -> list[Recording]:
@@ -72,8 +75,7 @@ def _of_list(path: Path) -> list[Recording]:
         except ValueError as error:
             raise DatasetError(f"{path}:{number}: {error}: quote paths as in a shell") from error
         if words:
-            is_file = not _is_address(words[0])
-            place = str(path.parent / Path(words[0]).expanduser()) if is_file else words[0]
+            place = words[0] if _is_live(words[0]) else str(path.parent / Path(words[0]).expanduser())
             found.append(Recording(place, tuple(words[1:])))
     if not found:
         raise DatasetError(f"{path}: lists no recordings; a line is a path, optionally with options of a run")
