@@ -74,24 +74,25 @@ class _References:
     @classmethod
     def of(cls, map_: Map) -> _References:
         """The view of each landmark nearest to the mean direction it is seen from."""
-        size, keyframes = map_.size, map_.keyframes
+        size, keyframes, often = map_.size, map_.keyframes, map_.seen_by(2)
         seen = [_seen(keyframe) for keyframe in keyframes]
         directions = [
             _unit(keyframe.center_w - map_.landmarks.position_w[ids])
             for keyframe, (_, ids) in zip(keyframes, seen, strict=True)
         ]
-        total, mean = np.zeros(size, dtype=np.int64), np.zeros((size, 3))
+        mean = np.zeros((size, 3))
         for (_, ids), direction in zip(seen, directions, strict=True):
-            total[ids] += 1  # a keyframe sees a landmark once
-            mean[ids] += direction
+            mean[ids] += direction  # a keyframe sees a landmark once
         mean = _unit(mean)
         best, chosen, chosen_feature = np.full(size, -np.inf), np.full(size, -1), np.full(size, -1)
+        is_often = np.zeros(size, dtype=np.bool_)
+        is_often[often] = True
         for number, ((at, ids), direction) in enumerate(zip(seen, directions, strict=True)):
             nearness = np.einsum("ni,ni->n", direction, mean[ids])
-            better = (nearness > best[ids]) & (total[ids] >= 2)
+            better = (nearness > best[ids]) & is_often[ids]
             ids = ids[better]
             best[ids], chosen[ids], chosen_feature[ids] = nearness[better], number, at[better]
-        return cls(chosen, chosen_feature, int(total[total >= 2].sum()))
+        return cls(chosen, chosen_feature, int(map_.landmarks.observations[often].sum()))
 
     def batches(self) -> Iterator[Ints]:
         """Landmarks whose views are in one another's company, by keyframe, some at a time."""
@@ -144,16 +145,19 @@ class _Batch:
         """The landmarks ``landmark_ids``, which are ordered by the keyframe of their view."""
         place = np.full(map_.size, -1)
         place[landmark_ids] = np.arange(len(landmark_ids))
-        parts = []
         of_keyframe = references.keyframe[landmark_ids]
-        for number in np.unique(of_keyframe):
+
+        def templates(number: int) -> Templates:
             keyframe = map_.keyframes[number]
             features: Features = keyframe.features
             at = references.feature[landmark_ids[of_keyframe == number]]
             # finer than the level of the detector, which is where its error comes from
             spacing_px = np.sqrt(features.sigma_px[at])
             image = ImagePyramid(keyframe.frame.load_as_spilled())
-            parts.append(Templates.of(image, features.raw_px[at], spacing_px))
+            return Templates.of(image, features.raw_px[at], spacing_px)
+
+        with in_parallel(templates, np.unique(of_keyframe).tolist()) as making:
+            parts = [made.result() for made in making]
         return cls(map_, references, place, Templates.joined(parts))
 
     def aligned(self, keypoints: _Keypoints) -> _Keypoints:
