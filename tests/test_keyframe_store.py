@@ -181,7 +181,7 @@ def test_a_keyframe_knows_the_same_whether_it_is_spilled_or_not() -> None:
     assert spilled.prediction is not None
     assert spilled.prediction.load().gravity_share == spilled.prediction.gravity_share == 0.7
     np.testing.assert_array_equal(spilled.frame.load().gravity, GRAVITY)
-    assert spilled.frame.encoded_image().data == resident.frame.encoded_image().data
+    assert spilled.frame.image_bytes() == resident.frame.image_bytes()
 
 
 @pytest.mark.skipif(not hasattr(tempfile, "_O_TMPFILE_WORKS"), reason="files have names on this system")

@@ -86,18 +86,21 @@ class StoredFrame:
             self.index, self.timestamp_s, self._image.load(), self.camera, depth_m, gravity=self.gravity
         )
 
-    def encoded_image(self) -> Encoded:
-        """The image as a spilled one is written, whether it was spilled or not. Raises as :meth:`load`."""
-        if self._resident is None and self._image is not None:
-            return self._image.encoded()
-        return encode_image(self.load().image_rgb)
+    def image_bytes(self) -> bytes:
+        """The JPEG that a spilled image is kept as, whether it was spilled or not. Raises as :meth:`load`."""
+        return self._encoded().data
 
     def load_as_spilled(self) -> NDArray[np.uint8]:
         """The image ``(H, W, 3)`` as a spilled one is read back, whether it was spilled or not.
 
         What it decides does not depend on how much memory there is. Raises as :meth:`load`.
         """
-        return np.asarray(self.encoded_image().array())
+        return np.asarray(self._encoded().array())
+
+    def _encoded(self) -> Encoded:
+        if self._resident is None and self._image is not None:
+            return self._image.encoded()
+        return encode_image(self.load().image_rgb)
 
     def _spill(self, file: SpillFile) -> None:
         """Move the images to ``file``."""

@@ -135,7 +135,7 @@ def _odometry(map_: MapView) -> dict[str, NDArray[Any]]:
 
 def _images(map_: MapView) -> dict[str, NDArray[Any]]:
     kept = [keyframe for keyframe in map_.keyframes if keyframe.frame.is_kept]
-    files = [keyframe.frame.encoded_image().data for keyframe in kept]
+    files = [keyframe.frame.image_bytes() for keyframe in kept]
     return {
         "keyframe": np.array([keyframe.id for keyframe in kept], dtype=np.int64),
         "first_byte": np.concatenate([[0], np.cumsum([len(file) for file in files])]).astype(np.int64),
