@@ -1,42 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keypoints moved to where the images agree to a part of a pixel, and points triangulated from them.
 
-A tracker's keypoints are as coarse as the scale they were found at: up to 3.6 pixels. Each point is therefore
-followed from one of its views into the others (Lucas and Kanade 1981), starting at the keypoint. Where the
-way back does not lead home, the observation is left out. Poses stay as they are. Lindenberger et al.
+A tracker's keypoints are those of its images, which may be smaller than the exported ones, and as coarse as
+the scale they were found at where the run did not align them. The patch of each point in one of its views is
+therefore found again in the others (:mod:`slamdepth.frontend.patch_alignment`), starting at the keypoint.
+Where it is not found, the observation is left out. Poses stay as they are. Lindenberger et al.
 ("Pixel-Perfect Structure-from-Motion", ICCV 2021) adjust keypoints to the same end.
 """
 
 from __future__ import annotations
-
-from collections import OrderedDict
-from typing import Any
 
 import numpy as np
 
 from slamdepth.export.images import ExportImages
 from slamdepth.export.scene import ExportScene
 from slamdepth.export.tracks import MAX_ERROR_PX, Tracks, numbered
+from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, align, facing_warp
 from slamdepth.geometry import invert
 from slamdepth.mapping.codec import Encoded, encode_image
 from slamdepth.typing import Bools, Bytes, Floats, Ints
 
 _WORKING_PX = 1280  # longest side of the images that are compared
-_WINDOW_PX = 21
-_HOME_PX = 0.5  # the way there and back
-_STEPS = (30, 0.01)  # at most, and until a step is so many pixels
+_SPACING_PX = 1.5  # of a patch's samples
+_LEAST_CORRELATION = 0.85
+_MOST_ZOOM = 2.0  # of one view against another: a patch at another size shows other things
 _TRIANGULATIONS = 8
 _DAMPING = 1e-3  # of a Gauss-Newton step
 _HUBER_PX = 1.0
-_OPEN = 32  # images decoded at a time
 
 
-class GreyImages:
-    """Grey images of the views at a working size, compressed in memory."""
+class SmallImages:
+    """Images of the views at a working size, compressed in memory."""
 
     def __init__(self) -> None:
         self._encoded: dict[int, Encoded] = {}
-        self._decoded: OrderedDict[int, Bytes] = OrderedDict()
         self.share = 1.0
         """Pixels of the working size in one of the exported image."""
 
@@ -54,21 +51,13 @@ class GreyImages:
     def __contains__(self, number: int) -> bool:
         return number in self._encoded
 
-    def load(self, number: int) -> Bytes:
-        """The image ``(h, w)`` of a view."""
-        import cv2
-
-        if number not in self._decoded:
-            encoded = self._encoded[number]
-            self._decoded[number] = np.asarray(cv2.cvtColor(encoded.array(), cv2.COLOR_RGB2GRAY), np.uint8)
-            if len(self._decoded) > _OPEN:
-                self._decoded.popitem(last=False)
-        self._decoded.move_to_end(number)
-        return self._decoded[number]
+    def load(self, number: int) -> ImagePyramid:
+        """The image of a view."""
+        return ImagePyramid(np.asarray(self._encoded[number].array(), np.uint8))
 
 
 def refine_tracks(
-    scene: ExportScene, images: ExportImages, tracks: Tracks, greys: GreyImages
+    scene: ExportScene, images: ExportImages, tracks: Tracks, small: SmallImages
 ) -> tuple[Tracks, Ints]:
     """Refine keypoints and points.
 
@@ -80,12 +69,13 @@ def refine_tracks(
     point = np.concatenate(tracks.rows)
     px = np.concatenate(tracks.keypoints_px)
     T_camera_world = invert(np.array([one.T_world_camera for one in scene.views]))
-    seen = np.flatnonzero((point >= 0) & np.array([n in greys for n in range(len(scene.views))])[view])
+    seen = np.flatnonzero((point >= 0) & np.array([n in small for n in range(len(scene.views))])[view])
+    if len(seen) == 0:
+        return tracks, np.arange(len(tracks.points_m))
     moved = px.copy()
     found = np.zeros(len(px), np.bool_)
-    depth = _depth(T_camera_world[view[seen]], tracks.points_m[point[seen]])
-    moved[seen], found[seen] = _followed(
-        view[seen], point[seen], px[seen], depth, greys, images.magnification
+    moved[seen], found[seen] = _aligned(
+        T_camera_world, tracks.points_m, view[seen], point[seen], px[seen], images, small
     )
     count = np.bincount(point[found], minlength=len(tracks.points_m))
     found[found] = count[point[found]] >= 2
@@ -111,53 +101,62 @@ def refine_tracks(
     )
 
 
-def _followed(
-    view: Ints, point: Ints, px: Floats, depth: Floats, greys: GreyImages, magnification: float
+def _aligned(
+    T_camera_world: Floats,
+    points_m: Floats,
+    view: Ints,
+    point: Ints,
+    px: Floats,
+    images: ExportImages,
+    small: SmallImages,
 ) -> tuple[Floats, Bools]:
-    """Pixels ``(M, 2)`` of observations as followed from each point's reference, and which were found.
+    """Pixels ``(M, 2)`` of observations: where the patch of each point's reference is; which were found."""
+    reference = _references(T_camera_world, points_m, view, point)
+    own = np.flatnonzero(reference == np.arange(len(point)))
+    own = own[np.argsort(view[own], kind="stable")]
+    working_px = (px + 0.5) * small.share - 0.5
+    patches = Templates.joined(
+        [
+            Templates.of(small.load(number), working_px[at], np.full(len(at), _SPACING_PX))
+            for number in np.unique(view[own])
+            for at in [own[view[own] == number]]
+        ]
+    )
+    patch = np.full(len(points_m), -1)
+    patch[point[own]] = np.arange(len(own))
+    usable = patches.is_usable[patch[point]]
+    found = usable & (reference == np.arange(len(point)))
+    focal_px = small.share * np.array([images.camera.fx, images.camera.fy])
+    others = np.flatnonzero(usable & ~found)
+    for number in np.unique(view[others]):
+        at = others[view[others] == number]
+        shown_by = view[reference[at]]
+        warp = np.empty((len(at), 2, 2))
+        for other in np.unique(shown_by):
+            here = shown_by == other
+            warp[here] = facing_warp(
+                T_camera_world[number], T_camera_world[other], points_m[point[at[here]]], focal_px
+            )
+        there, correlation = align(small.load(number), patches.taken(patch[point[at]]), warp, working_px[at])
+        zoom = np.sqrt(np.abs(np.linalg.det(warp)))
+        way_px = np.linalg.norm(there - working_px[at], axis=1)
+        good = (correlation > _LEAST_CORRELATION) & (zoom < _MOST_ZOOM) & (zoom > 1.0 / _MOST_ZOOM)
+        good &= way_px < MAX_ERROR_PX * small.share * images.magnification
+        working_px[at[good]], found[at] = there[good], good
+    return (working_px + 0.5) / small.share - 0.5, found
 
-    The reference of a point is the view whose distance is nearest to the mean of all: no view shows it much
-    larger or smaller.
-    """
-    log_depth = np.log(depth)
-    mean = np.bincount(point, log_depth) / np.maximum(np.bincount(point), 1)
-    order = np.lexsort((np.abs(log_depth - mean[point]), point))
-    reference = np.full(len(mean), -1)
+
+def _references(T_camera_world: Floats, points_m: Floats, view: Ints, point: Ints) -> Ints:
+    """Of each observation ``(M,)``, that of its point by the view nearest to the mean direction of all."""
+    towards = invert(T_camera_world)[view, :3, 3] - points_m[point]
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    mean = np.zeros_like(points_m)
+    np.add.at(mean, point, towards)
+    order = np.lexsort((-np.einsum("ni,ni->n", towards, mean[point]), point))
     names, first = np.unique(point[order], return_index=True)
+    reference = np.full(len(points_m), -1)
     reference[names] = order[first]
-    source = reference[point]
-    found = source == np.arange(len(point))  # a reference is where it is
-    moved = px.copy()
-    others = np.flatnonzero(~found)
-    pairs = np.stack([view[source[others]], view[others]], axis=1)
-    for pair in np.unique(pairs, axis=0):
-        at = others[(pairs == pair).all(axis=1)]
-        there, good = _flow(greys, pair[0], pair[1], px[source[at]], px[at], magnification)
-        moved[at[good]], found[at] = there[good], good
-    return moved, found
-
-
-def _flow(
-    greys: GreyImages, a: int, b: int, px_a: Floats, px_b: Floats, magnification: float
-) -> tuple[Floats, Bools]:
-    """Follow pixels from image ``a`` into ``b``, near ``px_b``; which lead back home."""
-    import cv2
-
-    image_a, image_b = greys.load(a), greys.load(b)
-    reach_px = MAX_ERROR_PX * greys.share * magnification
-    start, guess = (((px + 0.5) * greys.share - 0.5).astype(np.float32)[:, None] for px in (px_a, px_b))
-    settings: dict[str, Any] = {
-        "winSize": (_WINDOW_PX, _WINDOW_PX),
-        "maxLevel": 1 if reach_px <= MAX_ERROR_PX else 2,
-        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, *_STEPS),
-        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-    }
-    there, found, _ = cv2.calcOpticalFlowPyrLK(image_a, image_b, start, guess.copy(), **settings)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(image_b, image_a, there, start.copy(), **settings)
-    good = (found[:, 0] > 0) & (found_back[:, 0] > 0)
-    good &= np.linalg.norm(back - start, axis=2)[:, 0] < _HOME_PX
-    good &= np.linalg.norm(there - guess, axis=2)[:, 0] < reach_px
-    return (there[:, 0].astype(np.float64) + 0.5) / greys.share - 0.5, np.asarray(good, np.bool_)
+    return np.asarray(reference[point], np.int64)
 
 
 def _triangulated(points_m: Floats, T_camera_world: Floats, point: Ints, px: Floats, K: Floats) -> Floats:
@@ -186,9 +185,3 @@ def _projected(T_camera_world: Floats, points_w: Floats, K: Floats) -> tuple[Flo
     points_c = np.einsum("nij,nj->ni", T_camera_world[:, :3, :3], points_w) + T_camera_world[:, :3, 3]
     px = points_c[:, :2] / points_c[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
     return points_c, px
-
-
-def _depth(T_camera_world: Floats, points_w: Floats) -> Floats:
-    """Depth ``(M,)`` of points in their cameras, positive."""
-    z = np.einsum("nj,nj->n", T_camera_world[:, 2, :3], points_w) + T_camera_world[:, 2, 3]
-    return np.asarray(np.maximum(z, 1e-6), np.float64)

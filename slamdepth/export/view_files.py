@@ -10,7 +10,7 @@ import numpy as np
 
 from slamdepth.errors import ImageDecodeError
 from slamdepth.export.images import ExportImages, ImageMode
-from slamdepth.export.refine import GreyImages, refine_tracks
+from slamdepth.export.refine import SmallImages, refine_tracks
 from slamdepth.export.registry import ExportRequest
 from slamdepth.export.tracks import Colours, Tracks, build_tracks
 from slamdepth.mapping.codec import encode_image
@@ -47,9 +47,9 @@ def write_views(request: ExportRequest, images: ExportImages, folder: Path) -> W
     if not scene.has_tracks:
         return Written(None, np.zeros((0, 3), np.uint8), _write_images(request, images, folder))
     tracks = build_tracks(scene, images)
-    colours, greys = Colours(tracks), GreyImages()
-    missing = _write_images(request, images, folder, colours, greys)
-    refined, kept = refine_tracks(scene, images, tracks, greys)
+    colours, small = Colours(tracks), SmallImages()
+    missing = _write_images(request, images, folder, colours, small)
+    refined, kept = refine_tracks(scene, images, tracks, small)
     return Written(refined, colours.rgb()[kept], missing, tracks.mean_error_px)
 
 
@@ -58,7 +58,7 @@ def _write_images(
     images: ExportImages,
     folder: Path,
     colours: Colours | None = None,
-    greys: GreyImages | None = None,
+    small: SmallImages | None = None,
 ) -> tuple[int, ...]:
     """Write the image of each view, and hand it on.
 
@@ -85,8 +85,8 @@ def _write_images(
             continue
         if colours is not None:
             colours.add(number, image_rgb)
-        if greys is not None:
-            greys.add(number, image_rgb)
+        if small is not None:
+            small.add(number, image_rgb)
         if is_written:
             (folder / FOLDER / image_name(number)).write_bytes(encode_image(image_rgb).data)
     request.tell(len(views), len(views))

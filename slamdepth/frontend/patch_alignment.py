@@ -156,6 +156,24 @@ def align(image: ImagePyramid, templates: Templates, warp: Floats, px: Floats) -
     return px, np.asarray((found * templates.values * _WEIGHTS).sum(axis=1), np.float64)
 
 
+def facing_warp(
+    T_camera_world: Floats, T_reference_world: Floats, points_w: Floats, focal_px: Floats
+) -> Floats:
+    """``(N, 2, 2)`` from offsets in a reference's image to offsets in a camera's, about each point.
+
+    Args:
+        T_camera_world: ``(4, 4)``; T_reference_world: ``(4, 4)``.
+        points_w: ``(N, 3)`` on surfaces that are taken to face the reference.
+        focal_px: ``(2,)`` of both, along x and y.
+    """
+    x, y, z = (points_w @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]).T
+    zero = np.zeros_like(z)
+    projection = np.stack([np.stack([1 / z, zero, -x / z**2], 1), np.stack([zero, 1 / z, -y / z**2], 1)], 1)
+    rotation = (T_camera_world[:3, :3] @ T_reference_world[:3, :3].T)[:, :2] / focal_px
+    depth = points_w @ T_reference_world[2, :3] + T_reference_world[2, 3]
+    return np.asarray(focal_px[:, None] * (projection @ rotation) * depth[:, None, None])
+
+
 def _smoothed(image: Floats32) -> Floats32:
     import cv2
 

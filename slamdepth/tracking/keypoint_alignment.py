@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamdepth.frontend.features import Features, ScaleLevels
-from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, align
+from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, align, facing_warp
 from slamdepth.mapping.map import Map, MapKeyframe
 from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.tracking.workers import in_parallel
@@ -182,24 +182,18 @@ class _Batch:
 
 
 def _warp(map_: Map, keyframe: MapKeyframe, landmark_ids: Ints, references: Ints) -> Floats:
-    """``(N, 2, 2)`` from offsets in pixels of each landmark's view to offsets in ``keyframe``.
-
-    Surfaces are taken to face the view they are aligned to.
-    """
+    """``(N, 2, 2)`` from offsets in pixels of each landmark's view to offsets in ``keyframe``."""
     camera = keyframe.frame.camera
-    focal = np.array([camera.fx, camera.fy])
-    position = map_.landmarks.position_w[landmark_ids]
-    T = keyframe.T_camera_world
-    x, y, z = (position @ T[:3, :3].T + T[:3, 3]).T
-    zero = np.zeros_like(z)
-    projection = np.stack([np.stack([1 / z, zero, -x / z**2], 1), np.stack([zero, 1 / z, -y / z**2], 1)], 1)
+    focal_px = np.array([camera.fx, camera.fy])
     warp = np.empty((len(landmark_ids), 2, 2))
     for number in np.unique(references):
         at = np.flatnonzero(references == number)
-        T_other = map_.keyframes[number].T_camera_world
-        depth = position[at] @ T_other[2, :3] + T_other[2, 3]
-        rotation = (T[:3, :3] @ T_other[:3, :3].T)[:, :2] / focal
-        warp[at] = focal[:, None] * (projection[at] @ rotation) * depth[:, None, None]
+        warp[at] = facing_warp(
+            keyframe.T_camera_world,
+            map_.keyframes[number].T_camera_world,
+            map_.landmarks.position_w[landmark_ids[at]],
+            focal_px,
+        )
     return warp
 
 
