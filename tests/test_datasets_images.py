@@ -144,6 +144,12 @@ def test_other_folders_are_not_taken(tmp_path: Path) -> None:
     assert not isinstance(open_dataset(make_sevenscenes(tmp_path / "seq-01")), FolderSequence)
 
 
+def test_a_folder_of_nothing_but_videos_says_to_name_one(tmp_path: Path) -> None:
+    (tmp_path / "walk.mp4").write_bytes(b"")
+    with pytest.raises(DatasetError, match=r"holds 1 video: name one, such as '.*walk\.mp4'"):
+        open_dataset(tmp_path)
+
+
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=3))
 def test_garbage_is_refused(tmp_path_factory: pytest.TempPathFactory, contents: list[bytes]) -> None:
     folder = tmp_path_factory.mktemp("garbage")

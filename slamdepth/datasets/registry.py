@@ -149,6 +149,11 @@ def open_dataset(
             f"{path}: is a file; a sequence is a folder or a video ({known}), or another file that "
             "docs/inputs.md lists"
         )
+    if inside := sorted(one for one in path.iterdir() if one.suffix.lower() in VIDEO_ENDINGS):
+        raise DatasetError(
+            f"{path}: no known sequence layout, but it holds {len(inside)} video{'s' * (len(inside) > 1)}: "
+            f"name one, such as '{inside[0]}'"
+        )
     layouts = "; ".join(f"{reader.name} ({reader.needs})" for reader in readers)
     raise DatasetError(f"{path}: no known sequence layout; known are: {layouts}")
 
