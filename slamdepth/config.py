@@ -62,7 +62,7 @@ class TrackingConfig(_Section):
     )
     local_keyframes: int = Field(12, ge=2, description="keyframes whose points are searched for")
     depth_delay: int = Field(
-        10, ge=0, le=30, description="frames after a keyframe until its predicted depth joins the map"
+        8, ge=0, le=30, description="frames after a keyframe until its predicted depth joins the map"
     )
     new_maps: bool = Field(
         True,

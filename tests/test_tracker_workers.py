@@ -85,8 +85,8 @@ class HeldBack(ConstantDepth):
 
 def test_landmarks_are_created_between_two_frames_without_another_step() -> None:
     model = HeldBack()
-    # a short delay: no frame wants a third keyframe, and so the depth earlier, while two wait
-    config = Config.from_dict(merge(CONFIG.model_dump(), {"tracking": {"depth_delay": 3}}))
+    # long enough to adjust what earlier keyframes gave, and no frame wants another keyframe meanwhile
+    config = Config.from_dict(merge(CONFIG.model_dump(), {"tracking": {"depth_delay": 6}}))
     due = before = after = 0
     with Tracker(CAMERA, model, config) as tracker:
         for frame in frames(change=colour_only):

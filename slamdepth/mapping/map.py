@@ -103,6 +103,11 @@ class Map(MapView):
             state.predicted_log_depth = predicted_log_depth.copy()
         state.scale = scale
 
+    def set_prior(self, keyframe: MapKeyframe, log_depth: Floats, sigma_log: Floats) -> None:
+        """Give a keyframe's features a depth, for the arguments see :class:`MapKeyframe`."""
+        state = self._states[keyframe.id]
+        state.log_depth, state.sigma_log = log_depth.copy(), sigma_log.copy()
+
     def set_features(self, keyframe: MapKeyframe, features: Any) -> None:
         """Replace a keyframe's features by the same ones at corrected pixels."""
         self._states[keyframe.id].features = features

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -190,10 +191,17 @@ class FramePlacer:
         self._parts.motion.forget()
         return raw, self._parts.localiser.reoptimise(raw, placement)
 
+    def place_in_adjusted_map(self, features: Features, placement: Placement) -> Placement:
+        """Place a frame again, once the landmarks that a keyframe got from earlier ones are adjusted."""
+        return self._place_again(features, placement, self._parts.integration.run_until_adjusted)
+
     def place_in_grown_map(self, features: Features, placement: Placement) -> Placement:
-        """Place a frame again, once the keyframe that waits longest has created its landmarks."""
+        """Place a frame again, once the keyframe that waits longest has its own depth."""
+        return self._place_again(features, placement, self._parts.integration.run_until_landmarks)
+
+    def _place_again(self, features: Features, placement: Placement, grow: Callable[[], None]) -> Placement:
         pose = AnchoredPose.of(placement.T_camera_world, self._parts.map.keyframes[-1])
-        self._parts.integration.run_until_landmarks()
+        grow()
         self._parts.motion.follow_map()
         carried = replace(
             placement,

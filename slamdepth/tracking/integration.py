@@ -2,10 +2,11 @@
 """How a keyframe joins the map: at once, and stage by stage when its depth is there.
 
 A network takes several frames' time for one depth map. So a keyframe joins the map at once with the
-landmarks it sees, its depth is predicted in another thread, and a fixed number of frames later, or
-earlier where tracking needs it, landmarks are created and the window is adjusted. Meanwhile another
-frame may become a keyframe. What happens when depends on the frames alone and not on how fast the
-threads were, so the trajectory is the same on every run.
+landmarks it sees and those that the depth of earlier keyframes gives it, and the window is adjusted. Its own
+depth is predicted in another thread; a fixed number of frames later, or earlier where tracking needs it,
+landmarks are created from it and the window is adjusted again. Meanwhile other frames may become keyframes.
+What happens when depends on the frames alone and not on how fast the threads were, so the trajectory is the
+same on every run.
 
 Each stage runs between two frames, so that none of them delays a frame for long.
 """
@@ -42,26 +43,30 @@ from slamdepth.types import Camera, Frame
 from slamdepth.typing import Floats
 
 _MAX_WAITING = 2  # keyframes; with three, landmarks are missed that the oldest would have created
+_MAX_PENDING = 5  # keyframes whose integration is not complete
+_MOSTLY_KNOWN = 0.5  # of the features without a landmark: what is missing is not waited for
 _WAITED_FOR = 4  # first keyframes whose depth is waited for: all that follows builds on their landmarks
 
 
 class _Stage(IntEnum):
     """What is next for a keyframe."""
 
-    LANDMARKS = 0
-    ADJUSTMENT = 1
-    LOOP = 2
-    ADJUSTMENT_OF_LOOP = 3
-    END = 4
+    SURFACE = 0
+    LANDMARKS = 1
+    ADJUSTMENT = 2
+    LOOP = 3
+    ADJUSTMENT_OF_LOOP = 4
+    END = 5
 
 
-@dataclass
+@dataclass(eq=False)
 class _Waiting:
     """A keyframe whose integration is not complete.
 
     Attributes:
-        frames_left: until its stages begin.
-        stage: that is next.
+        frames_left: until its own depth joins the map.
+        stage: that is next: landmarks that earlier keyframes gave it are adjusted, its own are created, ...
+        is_known: the depth of earlier keyframes gave it most of the landmarks that it lacked.
         neighbours: keyframes that are still to be searched for its landmarks.
         is_in_stage: a stage has begun and has not ended.
     """
@@ -69,13 +74,22 @@ class _Waiting:
     keyframe: MapKeyframe
     frames_left: int
     stages: Iterator[None] = field(default_factory=lambda: iter(()))
+    is_known: bool = False
     stage: _Stage = _Stage.LANDMARKS
     neighbours: list[int] = field(default_factory=list)
     is_in_stage: bool = False
 
     @property
-    def has_landmarks(self) -> bool:
+    def has_depth(self) -> bool:
         return self.stage > _Stage.LANDMARKS
+
+    @property
+    def is_adjusted(self) -> bool:
+        return self.stage > _Stage.SURFACE
+
+    @property
+    def is_due(self) -> bool:
+        return self.frames_left <= 0 or not self.is_adjusted
 
 
 class KeyframeIntegration:
@@ -111,7 +125,7 @@ class KeyframeIntegration:
         self._waiting: list[_Waiting] = []  # oldest first
         self.gravity = GravityConsensus()
         self._complete: list[MapKeyframe] = []
-        self._is_adjusting = False
+        self._adjusting: _Waiting | None = None
         self._readout: Future[BundleResult] | None = None
 
     @property
@@ -130,16 +144,17 @@ class KeyframeIntegration:
             "policy": self._policy.state(),
             "gravity": self.gravity.state(),
             "complete": [keyframe.id for keyframe in self._complete],
-            "dropped": self.mapper.dropped,
+            "mapper": self.mapper.state(),
         }
 
     def _waiting_state(self, waiting: _Waiting) -> Tree:
         keyframe = waiting.keyframe
         # what the image says of gravity is added by the time its depth is there
-        requested = None if waiting.has_landmarks else self._workers.depth.requested(keyframe.frame.load())
+        requested = None if waiting.has_depth else self._workers.depth.requested(keyframe.frame.load())
         return {
             "keyframe": keyframe.id,
             "frames_left": waiting.frames_left,
+            "is_known": waiting.is_known,
             "prediction": None if requested is None else prediction_state(requested),
             "stage": int(waiting.stage),
             "neighbours": waiting.neighbours,
@@ -151,13 +166,16 @@ class KeyframeIntegration:
         self._policy.restore(state["policy"])
         self.gravity.restore(state["gravity"])
         self._complete = [self._map.keyframes[k] for k in state["complete"]]
-        self.mapper.dropped = state["dropped"]
+        self.mapper.restore(state["mapper"])
         for one in state["waiting"]:
             keyframe = self._map.keyframes[one["keyframe"]]
             if one["prediction"] is not None:
                 self._workers.depth.restore(keyframe.frame.load(), prediction_of(one["prediction"]))
             stage, neighbours = _Stage(one["stage"]), list(one["neighbours"])
-            self._wait(_Waiting(keyframe, one["frames_left"], stage=stage, neighbours=neighbours))
+            waiting = _Waiting(
+                keyframe, one["frames_left"], is_known=one["is_known"], stage=stage, neighbours=neighbours
+            )
+            self._wait(waiting)
         if state["readout"] is not None:
             self._readout = Future()
             self._readout.set_result(BundleResult.of_readout(*state["readout"]))
@@ -168,26 +186,38 @@ class KeyframeIntegration:
 
     @property
     def is_full(self) -> bool:
-        """Whether one more keyframe has to wait until the oldest has created its landmarks."""
-        return sum(not waiting.has_landmarks for waiting in self._waiting) >= _MAX_WAITING
+        """Whether one more keyframe has to wait until the oldest has its depth."""
+        unknown = sum(not (waiting.has_depth or waiting.is_known) for waiting in self._waiting)
+        return unknown >= _MAX_WAITING or len(self._waiting) >= _MAX_PENDING
 
     @property
     def awaits_landmarks(self) -> bool:
-        """Whether a keyframe has not created its landmarks yet."""
-        return any(not waiting.has_landmarks for waiting in self._waiting)
+        """Whether a keyframe has hardly any landmarks until its own depth is there."""
+        return any(not (waiting.has_depth or waiting.is_known) for waiting in self._waiting)
+
+    @property
+    def awaits_adjustment(self) -> bool:
+        """Whether landmarks that earlier keyframes have given are not adjusted yet."""
+        return any(not waiting.is_adjusted for waiting in self._waiting)
 
     @property
     def is_due(self) -> bool:
-        """Whether the next stage of the oldest waiting keyframe may run."""
-        return bool(self._waiting) and self._waiting[0].frames_left <= 0
+        """Whether a stage of a waiting keyframe may run."""
+        return self._due() is not None
+
+    def _due(self) -> _Waiting | None:
+        """Whose stage comes next: the keyframe that is being adjusted, or the oldest that may go on."""
+        if self._adjusting is not None:
+            return self._adjusting
+        return next((waiting for waiting in self._waiting if waiting.is_due), None)
 
     @property
     def is_adjusting(self) -> bool:
         """Whether an adjustment is in progress, during which landmark ids must not change."""
-        return self._is_adjusting
+        return self._adjusting is not None
 
     def count_frame(self) -> None:
-        """Count a frame; stages begin after ``tracking.depth_delay`` of them."""
+        """Count a frame; a keyframe's own depth joins the map after ``tracking.depth_delay`` of them."""
         for waiting in self._waiting:
             waiting.frames_left -= 1
 
@@ -208,10 +238,25 @@ class KeyframeIntegration:
             )
         self._policy.keyframe_made()
         delay = 0 if depth.is_instant(frame) else self._config.tracking.depth_delay
-        self._wait(_Waiting(keyframe, delay))
-        if len(self._map.keyframes) <= _WAITED_FOR or self._view_change.is_large:
+        is_waited_for = len(self._map.keyframes) <= _WAITED_FOR or self._view_change.is_large
+        waiting = _Waiting(keyframe, delay)
+        if delay > 0 and not (is_waited_for or self._view_change.doubts_depth):
+            self._give_surface(waiting)
+        self._wait(waiting)
+        if is_waited_for:
             self.run_all()
         return keyframe
+
+    def _give_surface(self, waiting: _Waiting) -> None:
+        """Create landmarks from the depth of earlier keyframes."""
+        keyframe = waiting.keyframe
+        with self._timed("surface"):
+            known = self.mapper.add_surface(keyframe)
+            if known > 0:
+                first_half = self.mapper.neighbours(keyframe)[::2]
+                self.mapper.search(keyframe, first_half, may_fuse=not self.is_adjusting)
+        if known >= _MOSTLY_KNOWN:
+            waiting.is_known, waiting.stage = True, _Stage.SURFACE
 
     def _wait(self, waiting: _Waiting) -> None:
         """Let a keyframe wait for its stages."""
@@ -220,8 +265,12 @@ class KeyframeIntegration:
         self._waiting.append(waiting)
 
     def _stages(self, waiting: _Waiting, words: Future[NDArray[np.float32]]) -> Iterator[None]:
-        """What follows a keyframe's depth, from its stage on; a frame is tracked at each ``yield``."""
+        """What follows, from the keyframe's stage on; a frame is tracked at each ``yield``."""
         keyframe = waiting.keyframe
+        if waiting.stage == _Stage.SURFACE:
+            yield from self._search_and_adjust(waiting, self.mapper.neighbours(keyframe)[1::2])
+            waiting.stage = _Stage.LANDMARKS
+            yield
         if waiting.stage == _Stage.LANDMARKS:
             prediction = self._workers.depth.take(keyframe.frame.load())
             with self._timed("mapping"):
@@ -258,14 +307,14 @@ class KeyframeIntegration:
             self.mapper.search(keyframe, neighbours)
         with self._timed("bundle"):
             adjustment = self.adjuster.begin_window(keyframe)
-        self._is_adjusting = adjustment is not None
+        self._adjusting = None if adjustment is None else waiting
         yield
         yield  # two frames' time for the side thread
         self._take_readout()
         with self._timed("bundle"):
             if adjustment is not None:
                 self.adjuster.complete(adjustment)
-                self._is_adjusting = False
+                self._adjusting = None
             if self._shutter.is_due(keyframe.id + 1):
                 self._readout = self.adjuster.begin_readout()
         waiting.is_in_stage = False
@@ -276,23 +325,33 @@ class KeyframeIntegration:
         if not self._waiting:
             return False
         while self._waiting:
-            self.run_stage()
+            self._run(self._adjusting or self._waiting[0])
         return True
 
     def run_until_landmarks(self) -> None:
-        """Run stages until one more waiting keyframe has created its landmarks."""
+        """Run stages until one more waiting keyframe has its own depth."""
         while self._waiting:
-            oldest = self._waiting[0]
-            had_landmarks = oldest.has_landmarks
-            self.run_stage()
-            if oldest.has_landmarks and not had_landmarks:
+            oldest = self._adjusting or self._waiting[0]
+            had_depth = oldest.has_depth
+            self._run(oldest)
+            if oldest.has_depth and not had_depth:
                 return
 
+    def run_until_adjusted(self) -> None:
+        """Run stages until one more keyframe is adjusted with the landmarks that earlier ones gave it."""
+        given = next((waiting for waiting in self._waiting if not waiting.is_adjusted), None)
+        while given is not None and not given.is_adjusted:
+            self._run(self._adjusting or given)
+
     def run_stage(self) -> None:
-        """Run the next stage of the oldest waiting keyframe."""
-        is_complete = next(self._waiting[0].stages, _COMPLETE) is _COMPLETE
-        if is_complete:
-            del self._waiting[0]
+        """Run the stage that is due."""
+        waiting = self._due()
+        if waiting is not None:
+            self._run(waiting)
+
+    def _run(self, waiting: _Waiting) -> None:
+        if next(waiting.stages, _COMPLETE) is _COMPLETE:
+            self._waiting.remove(waiting)
 
     def take_complete(self) -> list[MapKeyframe]:
         """The keyframes whose integration was completed since this was asked last, oldest first."""
@@ -307,7 +366,7 @@ class KeyframeIntegration:
             meetings: what the two maps were joined by.
         """
         self.gravity.absorb(other.gravity)
-        self.mapper.dropped += other.mapper.dropped
+        self.mapper.absorb(other.mapper)
         self.loops.join(other.loops, first, meetings)
         self._policy.keyframe_made()
         with self._timed("mapping"):

@@ -159,6 +159,8 @@ class MapTracker(MapParts):
         """Add a placed frame to the log, and to the map where the view has moved on."""
         features, placement = found.features, found.placement
         follows_motion = self.motion.is_known
+        if placement.is_loose and self.integration.awaits_adjustment:
+            placement = self._placer.place_in_adjusted_map(features, placement)
         if placement.is_loose and self.integration.awaits_landmarks:
             placement = self._placer.place_in_grown_map(features, placement)
         is_keyframe = self._run.grows_maps and self.integration.wants(placement)
