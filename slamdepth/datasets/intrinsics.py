@@ -94,10 +94,13 @@ def intrinsics_of(width: int, height: int, focal_35mm: float | None = None) -> I
     """
     if focal_35mm is not None:
         focal_px = focal_35mm * math.hypot(width, height) / _FULL_FRAME_DIAGONAL_MM
-        how = f"EXIF: as {focal_35mm:g} mm on 35 mm film, {focal_px:.1f} px; wrong if the image was cropped"
+        how = (
+            f"EXIF: as {focal_35mm:g} mm on 35 mm film, {_px(focal_px, width, height)}; wrong if the image "
+            "was cropped"
+        )
         return Intrinsics(centred_camera(width, height, focal_px), how, Certainty.NOMINAL)
     camera = camera_of_view(width, height, GUESSED_VIEW_DEG)
-    how = f"a guess: {GUESSED_VIEW_DEG:g} degrees across the longer side, so {camera.fx:.1f} px"
+    how = f"a guess: {GUESSED_VIEW_DEG:g} degrees across the longer side, so {_px(camera.fx, width, height)}"
     return Intrinsics(camera, how, Certainty.GUESSED)
 
 
@@ -113,11 +116,16 @@ def intrinsics_of_video(path: Path, width: int, height: int) -> tuple[Camera, Ca
         return _named(path, intrinsics_of(width, height))
     focal_px = focal_35mm * _OF_A_VIDEO * max(width, height) / _FULL_FRAME_DIAGONAL_MM
     how = (
-        f"the video's metadata: as {focal_35mm:g} mm on 35 mm film, {focal_px:.1f} px if the whole width "
-        "of the sensor was used"
+        f"the video's metadata: as {focal_35mm:g} mm on 35 mm film, {_px(focal_px, width, height)} if the "
+        "whole width of the sensor was used"
     )
     camera = centred_camera(width, height, focal_px)
     return camera, CameraSource(Certainty.NOMINAL, how, _VIDEO_SIGMA)
+
+
+def _px(focal_px: float, width: int, height: int) -> str:
+    """A focal length with the size of its pixels: frames may be tracked at another one."""
+    return f"{focal_px:.1f} px at {width}x{height}"
 
 
 def _named(path: Path, found: Intrinsics) -> tuple[Camera, CameraSource]:
