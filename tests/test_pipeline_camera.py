@@ -4,20 +4,26 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from command_line import call, copy_of
+from seen_scenes import CAMERA, scene
 
 from slamdepth.backend.self_calibration import Prior
+from slamdepth.backend.self_calibration_passes import Pass
 from slamdepth.config import Config
-from slamdepth.datasets import open_dataset
+from slamdepth.datasets import Dataset, open_dataset
 from slamdepth.datasets.intrinsics import CameraSource, Certainty, camera_of_view
 from slamdepth.depth.sensor import SensorDepth
-from slamdepth.pipeline.camera import OpeningCamera, check_camera, settle_camera, use_view
+from slamdepth.pipeline.camera import GUESSED_SIGMA, OpeningCamera, check_camera, settle_camera, use_view
 from slamdepth.report import CameraFacts
+from slamdepth.types import Camera
 
 GUESS = camera_of_view(640, 480, 60.0)
 GUESSED = CameraSource(Certainty.GUESSED, "a guess")
@@ -97,3 +103,40 @@ def test_a_camera_and_a_view_exclude_each_other(tiny_room: Path) -> None:
     done = call("run", tiny_room, "--camera", tiny_room / "camera.yaml", "--fov", "60", "--depth", "sensor")
     assert done.returncode == 2
     assert "exclude each other" in done.stderr
+
+
+def final_camera(opening: OpeningCamera, tracked: Camera, monkeypatch: pytest.MonkeyPatch) -> CameraFacts:
+    """The camera of a run whose map was tracked with ``tracked``; the true focal length is 480 px."""
+    dataset = SimpleNamespace(camera=tracked, notes=[])
+    monkeypatch.setattr("slamdepth.tracking.tracker.sights_seen", lambda tracker: scene())
+    return check_camera(cast("Dataset", dataset), opening, None)
+
+
+def test_a_map_that_agrees_with_its_guess_is_not_believed_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracked = replace(CAMERA, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
+    prior = Prior(GUESS.fx, GUESSED_SIGMA)
+    log_f = math.log(CAMERA.fx)
+    for opening in (
+        (),
+        (Pass(log_f, log_f, 0.005), Pass(log_f + 0.01, log_f, 0.005)),
+        (Pass(log_f + 0.35, log_f + 0.33, 0.005), Pass(log_f - 0.3, log_f - 0.29, 0.005)),
+    ):
+        facts = final_camera(OpeningCamera(GUESSED, prior, GUESSED_SIGMA, opening), tracked, monkeypatch)
+        assert not facts.is_observed
+        assert facts.sigma_log_f == GUESSED_SIGMA
+        assert facts.best == tracked
+
+
+def test_windows_from_far_starts_let_a_map_be_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    prior = Prior(GUESS.fx, GUESSED_SIGMA)
+    log_f = math.log(CAMERA.fx)
+    passes = (
+        Pass(math.log(GUESS.fx), log_f, 0.005),
+        Pass(log_f, log_f, 0.005),
+        Pass(log_f + 0.35, log_f, 0.005),
+    )
+    facts = final_camera(OpeningCamera(GUESSED, prior, 0.04, passes), CAMERA, monkeypatch)
+    assert facts.is_observed
+    assert facts.sigma_log_f is not None
+    assert 0.02 <= facts.sigma_log_f < 0.04
+    assert abs(math.log(facts.best.fx / CAMERA.fx)) < facts.sigma_log_f

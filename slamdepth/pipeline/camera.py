@@ -4,7 +4,9 @@
 Before the run proper, short windows of the recording are tracked with the camera as it is known so far, and
 the adjustment of what was seen (:mod:`slamdepth.backend.self_calibration`) gives the next one, until it
 settles: what a tracker accepts with a wrong camera agrees with that camera, so that one window is not
-enough. The map of the whole run is looked at once more at the end.
+enough. Where all of them started from much the same focal length, one starts far off: a guess that is found
+again may be right, or only believed (:mod:`slamdepth.backend.self_calibration_passes`). The map of the whole
+run is looked at once more at the end.
 """
 
 from __future__ import annotations
@@ -15,9 +17,8 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from slamdepth.backend.self_calibration import Prior, SelfCalibration, self_calibrate
+from slamdepth.backend.self_calibration_passes import FocalLength, Pass, focal_length_of
 from slamdepth.backend.sights import Sights
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset
@@ -28,6 +29,7 @@ from slamdepth.errors import CameraError, ImageDecodeError
 from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
 from slamdepth.pipeline.prefetch import FramePrefetcher
 from slamdepth.report import CameraFacts
+from slamdepth.types import Camera
 
 logger = logging.getLogger(__name__)
 
@@ -40,11 +42,11 @@ WINDOW = 150
 _PLACES = (0.0, 0.5, 0.25, 0.75, 0.0)  # of the windows, as shares of what is left of the recording
 _FEWEST_PASSES = 2
 _SETTLED = 0.01  # change of log f between two passes
-_SURE = 0.02  # deviation of log f after which further windows are not worth their time
+_SURE = 0.03  # deviation of log f after which further windows are not worth their time
 _SAME_CAMERA = 0.03  # windows tracked with a camera farther off say little
 _OBSERVED = 0.1  # a larger deviation of log f is no measurement
 _TOLD = 0.7  # of the deviation without the motion: one that is hardly smaller is not the motion's
-_MODEL_SIGMA = 0.02  # of log f: errors of windows of seven recordings beyond what their residuals tell
+_MODEL_SIGMA = 0.02  # of log f: what the lens model is off, which is the same in all windows of a recording
 _READOUT_SIGMA_S = 0.01
 
 
@@ -56,14 +58,19 @@ class OpeningCamera:
         source: where the first guess comes from.
         prior: what is known without the motion; None where the camera is not looked for.
         sigma_log_f: deviation of the logarithm of the focal length; None where the camera was given.
-        scatter: deviation of log f between the windows where it did not settle, else 0: a map agrees with the
-            camera it was tracked with, and cannot tell it.
+        passes: what each window said.
     """
 
     source: CameraSource
     prior: Prior | None = None
     sigma_log_f: float | None = None
-    scatter: float = 0.0
+    passes: tuple[Pass, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Window:
+    sights: Sights
+    said: Pass
 
 
 def use_view(dataset: Dataset, view_deg: float) -> None:
@@ -103,10 +110,8 @@ def settle_camera(
     logger.info("intrinsics are not given: %s", source.how)
     if config.odometry != "orb" or dataset.is_live:
         return OpeningCamera(source, None, sigma)
-    passes: list[tuple[float, Sights]] = []
-    settled: tuple[SelfCalibration, float] | None = None
-    scatter = 0.0
-    found_log_f: list[float] = []
+    windows: list[_Window] = []
+    best, opening = guess, math.inf
     for n, place in enumerate(_PLACES):
         start = round(place * max(0, len(indices) - WINDOW))
         window = indices[start : start + WINDOW]
@@ -116,25 +121,28 @@ def settle_camera(
             break
         if sights is None:
             continue
-        passes.append((math.log(dataset.camera.fx), sights))
-        found, change = _adjusted(passes, dataset, prior)
+        windows.append(_Window(sights, pass_of(sights, dataset.camera, prior)))
+        focal = _by_passes([one.said for one in windows], prior)
+        found, change = _adjusted(windows, focal, dataset.camera, prior)
         logger.info(
-            "pass %d: focal length %.1f px +- %.1f %%, k1 %.3f, before %.1f px",
-            n + 1, found.camera.fx, 100 * found.sigma_log_f, found.camera.distortion[0], dataset.camera.fx,
+            "pass %d: focal length %.1f px from %.1f px; all: %.1f px +- %.1f %%, memory %.2f; k1 %.3f",
+            n + 1, math.exp(windows[-1].said.found_log_f), dataset.camera.fx, math.exp(focal.log_f),
+            100 * focal.sigma, focal.memory, found.camera.distortion[0],
         )  # fmt: skip
-        settled = (found, math.hypot(found.sigma_log_f, change, _MODEL_SIGMA))
-        dataset.camera = found.camera
-        found_log_f.append(math.log(found.camera.fx))
-        has_settled = change < max(_SETTLED, found.sigma_log_f) and found.sigma_log_f < _SURE
-        if n + 1 >= _FEWEST_PASSES and has_settled:
-            scatter = 0.0
-            break
-        scatter = float(np.std(found_log_f))
-    if settled is not None and _is_observed(opening := math.hypot(settled[1], scatter), prior):
-        return OpeningCamera(source, prior, opening, scatter)
+        best, opening = found.camera, _deviation(focal, found.camera)
+        dataset.camera = best
+        if len(windows) >= _FEWEST_PASSES and focal.sigma < _SURE:
+            if change < max(_SETTLED, found.sigma_log_f):
+                break
+        elif len(windows) >= _FEWEST_PASSES and _span(windows) < GUESSED_SIGMA / 2 and n + 1 < len(_PLACES):
+            dataset.camera = _farther(best)
+    said = tuple(one.said for one in windows)
+    if _is_observed(opening, prior):
+        dataset.camera = best
+        return OpeningCamera(source, prior, opening, said)
     logger.warning("the motion of the first windows does not show the focal length")
     dataset.camera = guess
-    return OpeningCamera(source, prior, sigma)
+    return OpeningCamera(source, prior, sigma, said)
 
 
 def check_camera(dataset: Dataset, opening: OpeningCamera, tracker: object) -> CameraFacts:
@@ -151,11 +159,12 @@ def check_camera(dataset: Dataset, opening: OpeningCamera, tracker: object) -> C
         return CameraFacts(camera, opening.source, sigma_log_f=opening.sigma_log_f)
     found = self_calibrate(sights, camera, opening.prior)
     change = math.log(found.camera.fx / camera.fx)
-    sigma = math.hypot(found.sigma_log_f, change, _MODEL_SIGMA, opening.scatter)
+    focal = _by_passes([*opening.passes, pass_of(sights, camera, opening.prior)], opening.prior)
+    sigma = _deviation(focal, found.camera)
     is_observed = _is_observed(sigma, opening.prior)
     logger.info(
-        "final map: focal length %.1f px +- %.1f %%, tracked with %.1f px",
-        found.camera.fx, 100 * found.sigma_log_f, camera.fx,
+        "final map: focal length %.1f px, tracked with %.1f px; all: %.1f px +- %.1f %%, memory %.2f",
+        found.camera.fx, camera.fx, math.exp(focal.log_f), 100 * focal.sigma, focal.memory,
     )  # fmt: skip
     if not is_observed:
         sigma = opening.prior.sigma_log_f
@@ -181,14 +190,44 @@ def _is_observed(sigma: float, prior: Prior) -> bool:
     return sigma < min(_OBSERVED, _TOLD * prior.sigma_log_f)
 
 
+def pass_of(sights: Sights, camera: Camera, prior: Prior) -> Pass:
+    """What a stretch that was tracked with ``camera`` says by itself, whatever focal length was named."""
+    found = self_calibrate(sights, camera, replace(prior, sigma_log_f=max(prior.sigma_log_f, GUESSED_SIGMA)))
+    return Pass(math.log(camera.fx), math.log(found.camera.fx), found.sigma_log_f)
+
+
+def _by_passes(passes: Sequence[Pass], prior: Prior) -> FocalLength:
+    return focal_length_of(passes, math.log(prior.focal_px), prior.sigma_log_f)
+
+
+def _deviation(focal: FocalLength, camera: Camera) -> float:
+    """Of the logarithm of a camera's focal length."""
+    return math.hypot(focal.sigma, focal.log_f - math.log(camera.fx), _MODEL_SIGMA)
+
+
+def _span(windows: Sequence[_Window]) -> float:
+    """Of the focal lengths that windows were tracked with."""
+    tracked = [one.said.tracked_log_f for one in windows]
+    return max(tracked) - min(tracked)
+
+
+def _farther(camera: Camera) -> Camera:
+    """A camera of a focal length so much too long as a guess may be.
+
+    Too short a one bends what is seen at the border: a lens with distortion may not be left from there.
+    """
+    factor = math.exp(GUESSED_SIGMA)
+    return replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+
+
 def _adjusted(
-    passes: list[tuple[float, Sights]], dataset: Dataset, prior: Prior
+    windows: Sequence[_Window], focal: FocalLength, camera: Camera, prior: Prior
 ) -> tuple[SelfCalibration, float]:
-    """The camera by all windows that were tracked with one close to the latest, and how far f has changed."""
-    latest = passes[-1][0]
-    close = [sights for log_f, sights in passes if abs(log_f - latest) < _SAME_CAMERA]
-    found = self_calibrate(Sights.joined(close), dataset.camera, prior)
-    return found, abs(math.log(found.camera.fx) - latest)
+    """The camera by the windows that were tracked close to what all say, and how far f has changed."""
+    nearest = min((one.said.tracked_log_f for one in windows), key=lambda log_f: abs(log_f - focal.log_f))
+    close = [one.sights for one in windows if abs(one.said.tracked_log_f - nearest) < _SAME_CAMERA]
+    found = self_calibrate(Sights.joined(close), camera, prior)
+    return found, abs(math.log(found.camera.fx) - nearest)
 
 
 def sights_of_window(
