@@ -69,8 +69,25 @@ class OpeningCamera:
 
 @dataclass(frozen=True)
 class _Window:
+    """What was seen with a camera, and the camera that it shows, whatever focal length was named."""
+
     sights: Sights
-    said: Pass
+    tracked: Camera
+    found: SelfCalibration
+
+    @staticmethod
+    def of(sights: Sights, tracked: Camera, prior: Prior) -> _Window:
+        return _Window(sights, tracked, self_calibrate(sights, tracked, _unnamed(prior)))
+
+    @property
+    def said(self) -> Pass:
+        found = self.found
+        return Pass(math.log(self.tracked.fx), math.log(found.camera.fx), found.sigma_log_f)
+
+    def with_named(self, prior: Prior) -> SelfCalibration:
+        """The camera by what was seen and by the focal length that was named."""
+        is_the_same = prior == _unnamed(prior)
+        return self.found if is_the_same else self_calibrate(self.sights, self.tracked, prior)
 
 
 def use_view(dataset: Dataset, view_deg: float) -> None:
@@ -121,9 +138,9 @@ def settle_camera(
             break
         if sights is None:
             continue
-        windows.append(_Window(sights, pass_of(sights, dataset.camera, prior)))
+        windows.append(_Window.of(sights, dataset.camera, prior))
         focal = _by_passes([one.said for one in windows], prior)
-        found, change = _adjusted(windows, focal, dataset.camera, prior)
+        found, change = _adjusted(windows, focal, prior)
         logger.info(
             "pass %d: focal length %.1f px from %.1f px; all: %.1f px +- %.1f %%, memory %.2f; k1 %.3f",
             n + 1, math.exp(windows[-1].said.found_log_f), dataset.camera.fx, math.exp(focal.log_f),
@@ -157,9 +174,10 @@ def check_camera(dataset: Dataset, opening: OpeningCamera, tracker: object) -> C
     sights = None if opening.prior is None else sights_seen(tracker)
     if opening.prior is None or sights is None:
         return CameraFacts(camera, opening.source, sigma_log_f=opening.sigma_log_f)
-    found = self_calibrate(sights, camera, opening.prior)
+    whole = _Window.of(sights, camera, opening.prior)
+    found = whole.with_named(opening.prior)
     change = math.log(found.camera.fx / camera.fx)
-    focal = _by_passes([*opening.passes, pass_of(sights, camera, opening.prior)], opening.prior)
+    focal = _by_passes([*opening.passes, whole.said], opening.prior)
     sigma = _deviation(focal, found.camera)
     is_observed = _is_observed(sigma, opening.prior)
     logger.info(
@@ -190,10 +208,8 @@ def _is_observed(sigma: float, prior: Prior) -> bool:
     return sigma < min(_OBSERVED, _TOLD * prior.sigma_log_f)
 
 
-def pass_of(sights: Sights, camera: Camera, prior: Prior) -> Pass:
-    """What a stretch that was tracked with ``camera`` says by itself, whatever focal length was named."""
-    found = self_calibrate(sights, camera, replace(prior, sigma_log_f=max(prior.sigma_log_f, GUESSED_SIGMA)))
-    return Pass(math.log(camera.fx), math.log(found.camera.fx), found.sigma_log_f)
+def _unnamed(prior: Prior) -> Prior:
+    return replace(prior, sigma_log_f=max(prior.sigma_log_f, GUESSED_SIGMA))
 
 
 def _by_passes(passes: Sequence[Pass], prior: Prior) -> FocalLength:
@@ -220,14 +236,16 @@ def _farther(camera: Camera) -> Camera:
     return replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
 
 
-def _adjusted(
-    windows: Sequence[_Window], focal: FocalLength, camera: Camera, prior: Prior
-) -> tuple[SelfCalibration, float]:
+def _adjusted(windows: Sequence[_Window], focal: FocalLength, prior: Prior) -> tuple[SelfCalibration, float]:
     """The camera by the windows that were tracked close to what all say, and how far f has changed."""
-    nearest = min((one.said.tracked_log_f for one in windows), key=lambda log_f: abs(log_f - focal.log_f))
-    close = [one.sights for one in windows if abs(one.said.tracked_log_f - nearest) < _SAME_CAMERA]
-    found = self_calibrate(Sights.joined(close), camera, prior)
-    return found, abs(math.log(found.camera.fx) - nearest)
+    nearest = min(windows, key=lambda one: abs(one.said.tracked_log_f - focal.log_f))
+    log_f = nearest.said.tracked_log_f
+    close = [one.sights for one in windows if abs(one.said.tracked_log_f - log_f) < _SAME_CAMERA]
+    if len(close) == 1:
+        found = nearest.with_named(prior)
+    else:
+        found = self_calibrate(Sights.joined(close), nearest.tracked, prior)
+    return found, abs(math.log(found.camera.fx) - log_f)
 
 
 def sights_of_window(
