@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from seen_scenes import CAMERA, scene
 
-from slamdepth.backend.self_calibration_passes import SCATTER, Pass, focal_length_of
+from slamdepth.backend.self_calibration import Prior, self_calibrate
+from slamdepth.backend.self_calibration_passes import SCATTER, FocalLength, Pass, focal_length_of
+from slamdepth.datasets.intrinsics import camera_of_view
 
 TRUE = math.log(500.0)
 GUESS, GUESS_SIGMA = math.log(554.0), 0.35
@@ -85,3 +89,30 @@ def test_the_interval_covers_passes_of_any_memory_and_scatter() -> None:
     off = np.abs(whitened)
     assert 0.6 < np.mean(off < 1) < 0.85
     assert np.mean(off < 2) > 0.93
+
+
+def passes_over(path: str) -> FocalLength:
+    """The focal length by three windows of a path, the last one adjusted from far off."""
+    camera = guess = camera_of_view(640, 480, 60.0)
+    prior = Prior(guess.fx, GUESS_SIGMA)
+    passes = []
+    for window, factor in enumerate((1.0, 1.0, math.exp(0.35))):
+        tracked = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+        found = self_calibrate(scene(path, seed=window), tracked, prior)
+        passes.append(Pass(math.log(tracked.fx), math.log(found.camera.fx), found.sigma_log_f))
+        camera = found.camera
+    return focal_length_of(passes, math.log(guess.fx), GUESS_SIGMA)
+
+
+@pytest.mark.parametrize("path", ["hand", "turning"])
+def test_motion_that_turns_shows_the_focal_length(path: str) -> None:
+    found = passes_over(path)
+    assert found.sigma < 0.03
+    assert abs(found.log_f - math.log(CAMERA.fx)) < 2 * found.sigma
+
+
+@pytest.mark.parametrize("path", ["forward", "sideways"])
+def test_motion_straight_ahead_or_aside_leaves_a_wide_interval(path: str) -> None:
+    found = passes_over(path)
+    assert found.sigma > 0.1
+    assert abs(found.log_f - math.log(CAMERA.fx)) < 2 * found.sigma
