@@ -151,8 +151,8 @@ def settle_camera(
         if len(windows) >= _FEWEST_PASSES and focal.sigma < _SURE:
             if change < max(_SETTLED, found.sigma_log_f):
                 break
-        elif len(windows) >= _FEWEST_PASSES and _span(windows) < GUESSED_SIGMA / 2 and n + 1 < len(_PLACES):
-            dataset.camera = _farther(best)
+        elif len(windows) >= _FEWEST_PASSES and _farthest(windows, best) < GUESSED_SIGMA / 2:
+            dataset.camera = _too_long(best)
     said = tuple(one.said for one in windows)
     if _is_observed(opening, prior):
         dataset.camera = best
@@ -221,16 +221,15 @@ def _deviation(focal: FocalLength, camera: Camera) -> float:
     return math.hypot(focal.sigma, focal.log_f - math.log(camera.fx), _MODEL_SIGMA)
 
 
-def _span(windows: Sequence[_Window]) -> float:
-    """Of the focal lengths that windows were tracked with."""
-    tracked = [one.said.tracked_log_f for one in windows]
-    return max(tracked) - min(tracked)
+def _farthest(windows: Sequence[_Window], camera: Camera) -> float:
+    """How far off, in log f, windows were tracked from what they say."""
+    return max(abs(one.said.tracked_log_f - math.log(camera.fx)) for one in windows)
 
 
-def _farther(camera: Camera) -> Camera:
+def _too_long(camera: Camera) -> Camera:
     """A camera of a focal length so much too long as a guess may be.
 
-    Too short a one bends what is seen at the border: a lens with distortion may not be left from there.
+    From too short a one, which bends what is seen at the border, another minimum is found as often as not.
     """
     factor = math.exp(GUESSED_SIGMA)
     return replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
