@@ -105,6 +105,15 @@ def test_the_same_lines_give_the_same_bytes(roll_deg: float) -> None:
         assert one.support.tobytes() == other.support.tobytes()
 
 
+def test_a_quarter_turn_of_the_image_turns_its_lines_and_changes_nothing_else() -> None:
+    image = drawn(segments(2, 40), rotation_of(30, 15, 0), CAMERA)
+    turned_camera = Camera(480, 640, 520.0, 520.0, 239.5, 319.5)  # the top of the image is on its left
+    lines = find_lines(image, CAMERA)
+    turned = find_lines(np.ascontiguousarray(np.rot90(image)), turned_camera)
+    assert len(turned) == pytest.approx(len(lines), rel=0.1)
+    assert turned.weights.sum() == pytest.approx(lines.weights.sum(), rel=0.05)
+
+
 def test_too_few_lines_give_no_frame() -> None:
     blank = np.full((240, 320, 3), 128, np.uint8)
     camera = CAMERA.scaled(320, 240)

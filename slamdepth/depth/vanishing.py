@@ -20,9 +20,9 @@ from slamdepth.geometry import so3_exp
 from slamdepth.types import Camera
 from slamdepth.typing import Floats
 
-_WIDTH_PX = 340
-"""Lines are detected in an image of about this width: finer ones are texture."""
-_SHORTEST = 0.04  # of the image's width
+_LONGER_SIDE_PX = 340
+"""Lines are detected in an image whose longer side has about so many pixels: finer ones are texture."""
+_SHORTEST = 0.04  # of the image's longer side
 _LONGEST = 0.3  # longer ones weigh no more; tangents of angles
 _FEWEST_LINES = 8
 _TRIALS = 1000
@@ -66,14 +66,14 @@ class ManhattanFrame:
 
 def find_lines(image_rgb: NDArray[np.uint8], camera: Camera) -> Lines:
     """Straight lines of a raw image ``(H, W, 3)`` by LSD (von Gioi et al. 2010), undistorted."""
-    scale = min(1.0, _WIDTH_PX / image_rgb.shape[1])
+    scale = min(1.0, _LONGER_SIDE_PX / max(image_rgb.shape[:2]))
     grey = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
     if scale < 1.0:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     found = cv2.createLineSegmentDetector().detect(grey)[0]
     ends = np.zeros((0, 4)) if found is None else np.asarray(found, dtype=np.float64).reshape(-1, 4)
     length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
-    ends = ends[length > _SHORTEST * grey.shape[1]]
+    ends = ends[length > _SHORTEST * max(grey.shape)]
     ratio = np.array([image_rgb.shape[1] / grey.shape[1], image_rgb.shape[0] / grey.shape[0]])
     raw_px = (ends.reshape(-1, 2) + 0.5) * ratio - 0.5
     px = camera.undistort_points(raw_px) if len(raw_px) else raw_px
