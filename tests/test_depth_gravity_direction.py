@@ -90,6 +90,25 @@ def test_the_image_is_scored_again_rotated_by_each_probable_direction_if_there_a
     assert certain == [0.0]
 
 
+def share_of(size: tuple[int, int], *, is_same: bool = False) -> float:
+    """Share of the best direction where three looks are asked for, or always the same one is given."""
+    rolled = ManhattanFrame(so3_exp(np.array([0.0, 0.0, 0.6])), np.array([0.2, 0.2, 0.2]))
+    first = EncodedImage(TOKENS, size, 80.0, 0.0)
+
+    def encode(roll: float) -> EncodedImage:
+        return first if is_same or roll == 0.0 else EncodedImage(TOKENS, size, 80.0, roll)
+
+    found = estimate_gravity(PrefersSteep(3.0), [rolled], encode)
+    assert found is not None
+    return found.share
+
+
+def test_looks_at_a_portrait_image_are_averaged_and_count_once() -> None:
+    one, three = share_of((84, 56), is_same=True), share_of((84, 56))
+    assert three == pytest.approx(one, abs=0.02)
+    assert share_of((56, 84)) > three + 0.02  # added in a landscape image
+
+
 def test_directions_are_rotated_with_the_image() -> None:
     image = EncodedImage(TOKENS, (56, 84), 80.0, 0.4)
     gravity = np.array([np.sin(0.4), np.cos(0.4), 0.0])

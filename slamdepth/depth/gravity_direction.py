@@ -137,12 +137,14 @@ def estimate_gravity(
 
     The scorer sees the image as taken. Where more than one direction is probable, it also sees the image
     rotated upright by each of the two most probable ones, because upright images are recognised better.
-    With a guess of the roll it sees the image rotated upright by that, and no other.
+    In a portrait image these looks are averaged, see :func:`_added_by_more_looks`. With a guess of the roll it
+    sees the image rotated upright by that, and no other.
 
     Args:
         scorer: scores directions given the tokens.
         frames: the Manhattan frames whose axes are proposed.
-        encode: the image rotated upright from a roll in radians, or from about that roll.
+        encode: the image rotated upright from a roll in radians, or from about that roll; the same object
+            where it was asked for before.
         guess_rad: roll in radians that is expected; None where nothing is known.
     """
     if not frames:
@@ -150,20 +152,35 @@ def estimate_gravity(
     candidates = np.concatenate([np.concatenate([frame.axes, -frame.axes]) for frame in frames])
     support = np.repeat([frame.support.sum() for frame in frames], 6)
     prior_angle = np.arccos(np.clip(candidates @ _PRIOR_GRAVITY, -1.0, 1.0))
-    log_probability = (
-        _log_likelihood(scorer, encode(guess_rad or 0.0), candidates)
-        + _SUPPORT_WEIGHT * support
-        - prior_angle / _PRIOR_ANGLE_RAD
-    )
+    looks = [encode(guess_rad or 0.0)]
+    log_likelihoods = [_log_likelihood(scorer, looks[0], candidates)]
+    log_probability = log_likelihoods[0] + _SUPPORT_WEIGHT * support - prior_angle / _PRIOR_ANGLE_RAD
     if guess_rad is None:
         modes = _modes(candidates, _normalised(log_probability))
         for mode in modes if len(modes) > 1 else ():
-            log_probability = log_probability + _log_likelihood(scorer, encode(roll_rad(mode)), candidates)
+            looks.append(encode(roll_rad(mode)))
+            log_likelihoods.append(_log_likelihood(scorer, looks[-1], candidates))
+        for added in _added_by_more_looks(looks, log_likelihoods):
+            log_probability = log_probability + added
     probability = _normalised(log_probability)
     is_near = candidates @ candidates.T > _COS_SAME
     best = is_near[int((is_near @ probability).argmax())]
     gravity = probability[best] @ candidates[best]
     return GravityEstimate(gravity / np.linalg.norm(gravity), float(probability[best].sum()))
+
+
+def _added_by_more_looks(looks: Sequence[EncodedImage], log_likelihoods: Sequence[Floats]) -> list[Floats]:
+    """What all looks at an image add to the log likelihood ``(C,)`` of the candidates given the first one.
+
+    The looks show one scene and err together, the more so in portrait images, which the scorer was not
+    trained on. Where the first look, which is the image as taken, is portrait, each look counts once, and
+    the log likelihoods are averaged. Else they are added.
+    """
+    rows, columns = looks[0].size
+    if rows <= columns:
+        return list(log_likelihoods[1:])
+    once = {id(look): each for look, each in zip(looks, log_likelihoods, strict=True)}
+    return [np.mean(list(once.values()), axis=0) - log_likelihoods[0]]
 
 
 def _log_likelihood(scorer: GravityScorer, image: EncodedImage, candidates: Floats) -> Floats:
