@@ -53,6 +53,17 @@ def test_nothing_is_known_before_enough_images_agree() -> None:
     assert few.in_world() is apart.in_world() is None
 
 
+def test_enough_images_that_do_not_agree_are_told_from_too_few() -> None:
+    consensus = GravityConsensus()
+    for k, R in enumerate(rotations(6)):
+        assert not consensus.disagrees
+        consensus.add(R, R.T @ np.roll(GRAVITY_W, k % 2), 1.0)
+    assert consensus.disagrees
+    for R in rotations(9, seed=1):
+        consensus.add(R, R.T @ GRAVITY_W, 1.0)
+    assert not consensus.disagrees
+
+
 def test_an_estimate_of_low_confidence_counts_less() -> None:
     consensus = GravityConsensus()
     for k, R in enumerate(rotations(10)):

@@ -78,6 +78,11 @@ class GravityConsensus:
         self._estimates_w += other._estimates_w
         self._confidences += other._confidences
 
+    @property
+    def disagrees(self) -> bool:
+        """Whether enough images were asked, and there is no direction that most of them agree on."""
+        return len(self._estimates_w) >= _MIN_ESTIMATES and self.in_world() is None
+
     def in_world(self) -> Floats | None:
         """The unit direction ``(3,)`` in the world that most agree on; None before enough do."""
         return self._agreed(_MIN_ESTIMATES)

@@ -137,8 +137,8 @@ def estimate_gravity(
 
     The scorer sees the image as taken. Where more than one direction is probable, it also sees the image
     rotated upright by each of the two most probable ones, because upright images are recognised better.
-    In a portrait image these looks are averaged, see :func:`_added_by_more_looks`. With a guess of the roll it
-    sees the image rotated upright by that, and no other.
+    In a portrait image these looks are averaged, see :func:`_added_by_more_looks`. With a guess of the roll
+    it sees the image rotated upright by that, and no other.
 
     Args:
         scorer: scores directions given the tokens.

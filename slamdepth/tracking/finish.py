@@ -163,6 +163,8 @@ def optimise_map(tracked: MapTracker, config: Config) -> FinalMap:
     dropped = integration.mapper.dropped
     if dropped:
         notes.append(f"{dropped} predicted depth maps disagreed with the map and were not used")
+    if integration.gravity.disagrees:
+        notes.append("images disagree on gravity: it is unknown, and views stand as the camera was held")
     return FinalMap(tuple(notes), () if map_.is_measured or is_loaded else _make_metric(map_))
 
 
