@@ -100,8 +100,8 @@ def worker_of(model: GravityModel) -> Iterator[DepthWorker]:
         worker.close()
 
 
-def frame(index: int) -> Frame:
-    return Frame(index, float(index), np.zeros((24, 32, 3), np.uint8), CAMERA)
+def frame(index: int, camera: Camera = CAMERA) -> Frame:
+    return Frame(index, float(index), np.zeros((camera.height, camera.width, 3), np.uint8), camera)
 
 
 def test_later_frames_are_given_what_earlier_ones_agreed_on() -> None:
@@ -116,6 +116,17 @@ def test_later_frames_are_given_what_earlier_ones_agreed_on() -> None:
     asked = [k for k, is_asked in enumerate(model.is_asked) if is_asked]
     assert asked == [*range(6), 9]  # six, then every fifth
     assert all(np.allclose(gravity, GRAVITY_W) for gravity in given.values())
+
+
+def test_each_of_the_first_portrait_frames_is_asked_by_itself() -> None:
+    model, known = GravityModel(), GravityInMap(GravityConsensus(), np.eye(3))
+    with worker_of(model) as worker:
+        for k in range(12):
+            one = frame(k, Camera(24, 32, 30.0, 30.0, 11.5, 15.5))
+            worker.request(one, known)
+            worker.take(one)
+    assert [k for k, gravity in enumerate(model.given) if gravity is None] == list(range(6))
+    assert [k for k, is_asked in enumerate(model.is_asked) if is_asked] == [*range(6), 9]
 
 
 def test_images_of_two_maps_do_not_tell_one_another() -> None:

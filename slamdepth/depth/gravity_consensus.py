@@ -28,17 +28,19 @@ class GravityConsensus:
         self._confidences: list[float] = []
         self._queries = 0
 
-    def in_camera(self, R_world_camera: Floats) -> tuple[Floats | None, bool]:
+    def in_camera(self, R_world_camera: Floats, *, may_guess: bool = True) -> tuple[Floats | None, bool]:
         """Unit direction of gravity ``(3,)`` in a camera's frame, and whether the image should be asked too.
 
         Args:
             R_world_camera: ``(3, 3)``.
+            may_guess: False asks each of the first six images by itself.
 
         Returns:
-            No direction before two images agree. The image is asked before six do, and every fifth time.
+            No direction before two images agree, or six where there are no guesses. The image is asked before
+            six do, and every fifth time.
         """
         self._queries += 1
-        gravity_w = self._agreed(_MIN_GUESSES)
+        gravity_w = self._agreed(_MIN_GUESSES if may_guess else _MIN_ESTIMATES)
         if gravity_w is None:
             return None, True
         is_known = len(self._estimates_w) >= _MIN_ESTIMATES

@@ -145,7 +145,9 @@ class DepthWorker:
         if gravity is None or frame.gravity is not None:
             prediction = self._model.predict(frame)
         else:
-            known, is_asked = gravity.consensus.in_camera(gravity.R_world_camera)
+            # In portrait images gravity errs more often, and a wrong guess is confirmed by the next image.
+            is_portrait = frame.camera.height > frame.camera.width
+            known, is_asked = gravity.consensus.in_camera(gravity.R_world_camera, may_guess=not is_portrait)
             prediction = self._model.predict(replace(frame, gravity=known, gravity_is_guess=is_asked))
             if is_asked and prediction.gravity is not None:
                 gravity.consensus.add(gravity.R_world_camera, prediction.gravity, prediction.gravity_share)
