@@ -130,13 +130,9 @@ def _aligned(
     others = np.flatnonzero(usable & ~found)
     for number in np.unique(view[others]):
         at = others[view[others] == number]
-        shown_by = view[reference[at]]
-        warp = np.empty((len(at), 2, 2))
-        for other in np.unique(shown_by):
-            here = shown_by == other
-            warp[here] = facing_warp(
-                T_camera_world[number], T_camera_world[other], points_m[point[at[here]]], focal_px
-            )
+        warp = facing_warp(
+            T_camera_world[number], T_camera_world, view[reference[at]], points_m[point[at]], focal_px
+        )
         there, correlation = align(small.load(number), patches.taken(patch[point[at]]), warp, working_px[at])
         zoom = np.sqrt(np.abs(np.linalg.det(warp)))
         way_px = np.linalg.norm(there - working_px[at], axis=1)

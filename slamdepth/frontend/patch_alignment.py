@@ -157,21 +157,24 @@ def align(image: ImagePyramid, templates: Templates, warp: Floats, px: Floats) -
 
 
 def facing_warp(
-    T_camera_world: Floats, T_reference_world: Floats, points_w: Floats, focal_px: Floats
+    T_camera_world: Floats, T_reference_world: Floats, reference: Ints, points_w: Floats, focal_px: Floats
 ) -> Floats:
-    """``(N, 2, 2)`` from offsets in a reference's image to offsets in a camera's, about each point.
+    """``(N, 2, 2)`` from offsets in the image of each point's reference to offsets in a camera's.
 
     Args:
-        T_camera_world: ``(4, 4)``; T_reference_world: ``(4, 4)``.
-        points_w: ``(N, 3)`` on surfaces that are taken to face the reference.
-        focal_px: ``(2,)`` of both, along x and y.
+        T_camera_world: ``(4, 4)``; T_reference_world: ``(K, 4, 4)``.
+        reference: ``(N,)`` of each point.
+        points_w: ``(N, 3)`` on surfaces that are taken to face their reference.
+        focal_px: ``(2,)`` of all, along x and y.
     """
     x, y, z = (points_w @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]).T
     zero = np.zeros_like(z)
     projection = np.stack([np.stack([1 / z, zero, -x / z**2], 1), np.stack([zero, 1 / z, -y / z**2], 1)], 1)
-    rotation = (T_camera_world[:3, :3] @ T_reference_world[:3, :3].T)[:, :2] / focal_px
-    depth = points_w @ T_reference_world[2, :3] + T_reference_world[2, 3]
-    return np.asarray(focal_px[:, None] * (projection @ rotation) * depth[:, None, None])
+    turn = T_camera_world[:3, :3] @ T_reference_world[:, :3, :3].transpose(0, 2, 1)
+    towards = T_reference_world[:, 2][reference]
+    depth = (points_w * towards[:, :3]).sum(axis=1) + towards[:, 3]
+    warp = projection @ (turn[:, :, :2] / focal_px)[reference] * focal_px[:, None]
+    return np.asarray(warp * depth[:, None, None])
 
 
 def _smoothed(image: Floats32) -> Floats32:

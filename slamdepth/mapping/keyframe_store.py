@@ -34,6 +34,7 @@ class StoredFrame:
         self.index, self.timestamp_s = frame.index, frame.timestamp_s
         self.camera, self.gravity = frame.camera, frame.gravity
         self._resident: Frame | None = frame
+        self._jpeg: Encoded | None = None  # of a resident image, once it was asked for: a tenth of its size
         self._image: SpilledArray | None = None
         self._depth: SpilledArray | None = None
         self._read: Callable[[], Frame] | None = None
@@ -54,7 +55,7 @@ class StoredFrame:
         """
         stored = cls.__new__(cls)
         stored.index, stored.timestamp_s, stored.camera, stored.gravity = index, timestamp_s, camera, gravity
-        stored._resident = stored._image = stored._depth = None
+        stored._resident = stored._jpeg = stored._image = stored._depth = None
         stored._read = read
         return stored
 
@@ -100,7 +101,12 @@ class StoredFrame:
     def _encoded(self) -> Encoded:
         if self._resident is None and self._image is not None:
             return self._image.encoded()
-        return encode_image(self.load().image_rgb)
+        if self._jpeg is not None:
+            return self._jpeg
+        jpeg = encode_image(self.load().image_rgb)
+        if self._resident is not None:
+            self._jpeg = jpeg
+        return jpeg
 
     def _spill(self, file: SpillFile) -> None:
         """Move the images to ``file``."""
@@ -108,8 +114,8 @@ class StoredFrame:
             return
         if frame.depth_m is not None:
             self._depth = file.spill(encode_sensor_depth(frame.depth_m, frame.camera.depth_factor))
-        self._image = file.spill(encode_image(frame.image_rgb))
-        self._resident = None
+        self._image = file.spill(self._encoded())
+        self._resident = self._jpeg = None
 
 
 class StoredPrediction:

@@ -132,11 +132,13 @@ class _Batch:
     """Some landmarks, and the patch about each in the view that the others are aligned to.
 
     Attributes:
+        T_camera_world: ``(K, 4, 4)`` of the keyframes.
         place: ``(P,)`` of each landmark of the map in ``templates``, -1 for none.
     """
 
     map_: Map
     references: _References
+    T_camera_world: Floats
     place: Ints
     templates: Templates
 
@@ -158,7 +160,8 @@ class _Batch:
 
         with in_parallel(templates, np.unique(of_keyframe).tolist()) as making:
             parts = [made.result() for made in making]
-        return cls(map_, references, place, Templates.joined(parts))
+        T_camera_world = np.array([keyframe.T_camera_world for keyframe in map_.keyframes])
+        return cls(map_, references, T_camera_world, place, Templates.joined(parts))
 
     def aligned(self, keypoints: _Keypoints) -> _Keypoints:
         """Align what a keyframe sees of these landmarks."""
@@ -172,29 +175,20 @@ class _Batch:
         if len(at) == 0:
             return keypoints
         image = ImagePyramid(keyframe.frame.load_as_spilled())
-        warp = _warp(self.map_, keyframe, ids, self.references.keyframe[ids])
+        camera = keyframe.frame.camera
+        warp = facing_warp(
+            keyframe.T_camera_world,
+            self.T_camera_world,
+            self.references.keyframe[ids],
+            self.map_.landmarks.position_w[ids],
+            np.array([camera.fx, camera.fy]),
+        )
         px, correlation = align(image, self.templates.taken(self.place[ids]), warp, keypoints.raw_px[at])
         zoom = np.sqrt(np.abs(np.linalg.det(warp)))
         way = np.linalg.norm(px - keypoints.raw_px[at], axis=1) / keypoints.features.sigma_px[at]
         good = (correlation > _LEAST_CORRELATION) & (way < _FARTHEST)
         good &= (zoom < _MOST_ZOOM) & (zoom > 1.0 / _MOST_ZOOM)
         return keypoints.moved(at[good], px[good])
-
-
-def _warp(map_: Map, keyframe: MapKeyframe, landmark_ids: Ints, references: Ints) -> Floats:
-    """``(N, 2, 2)`` from offsets in pixels of each landmark's view to offsets in ``keyframe``."""
-    camera = keyframe.frame.camera
-    focal_px = np.array([camera.fx, camera.fy])
-    warp = np.empty((len(landmark_ids), 2, 2))
-    for number in np.unique(references):
-        at = np.flatnonzero(references == number)
-        warp[at] = facing_warp(
-            keyframe.T_camera_world,
-            map_.keyframes[number].T_camera_world,
-            map_.landmarks.position_w[landmark_ids[at]],
-            focal_px,
-        )
-    return warp
 
 
 def _seen(keyframe: MapKeyframe) -> tuple[Ints, Ints]:
