@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kill a run at random moments, go on with it, and compare its end with that of a run nobody killed.
+"""Kill a run in each of its stages, go on with it, and compare its end with that of a run nobody killed.
 
     python -m benchmarks.kills SEQ --kills 50 --depth sensor --work kills -o kills.json
 
-Each process is killed by SIGKILL after a random part of the time that the unbroken run took, be it while
-reading, tracking, meshing or writing the report; the next one goes on. When one ends by itself, its
-trajectory is compared with that of the unbroken run, and another run begins, until there were as many kills
-as asked for.
+Kills are spread evenly over the stages: opening, each half of tracking, and all that follows. A stage is left
+by SIGKILL after a random part of the time that it took in the unbroken run; the next process goes on, and is
+killed in a later stage. After four kills a run ends by itself, its files are compared with those of the
+unbroken run, and another run begins, until there were as many kills as asked for.
 """
 
 from __future__ import annotations
@@ -14,11 +14,14 @@ from __future__ import annotations
 import json
 import os
 import random
+import select
 import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -28,38 +31,116 @@ import numpy as np
 from benchmarks.command import errors_in_one_line, parser_of, progress_line
 from slamdepth.config import Config
 from slamdepth.io import read_tum_trajectory, write_json
+from slamdepth.pipeline.options import ProgressCallback, RunProgress, RunStage
 
 FILES = ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "mesh.ply")
-_STAGES = (
-    ("mesh.ply", "report"),
-    ("map/map.json", "dense depth and mesh"),
-    ("trajectory_online.txt", "tracking"),
-)
 
-
+_OPENING = "opening"
 _IN_A_ROW = 4  # kills of one run, so that many runs begin and end
+_SHORTEST_S = 0.01  # a stage that takes less is over before a kill arrives
 
 
-def in_a_child(work: Callable[[], None], kill_after_s: float | None) -> tuple[int, float]:
-    """Do something in a forked process; returns its exit code, negative by a signal, and its seconds."""
+@dataclass(frozen=True)
+class Kill:
+    """Kill a process so many seconds after it enters a stage, or as it leaves it."""
+
+    stage: str
+    after_s: float
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a process ended.
+
+    Attributes:
+        code: its exit code, negative by a signal.
+        stages: what it did, each with its seconds; the last one is what it was killed in.
+    """
+
+    code: int
+    stages: tuple[tuple[str, float], ...]
+
+
+def stage_of(state: RunProgress) -> str:
+    """What a run is doing, tracking in two halves."""
+    if state.stage is not RunStage.TRACKING:
+        return str(state.stage.value)
+    half = "second" if 2 * state.done >= state.total else "first"
+    return f"{state.stage.value}, {half} half"
+
+
+def in_a_child(work: Callable[[ProgressCallback], None], kill: Kill | None = None) -> Ended:
+    """Do something in a forked process, and perhaps kill it.
+
+    Args:
+        work: is given a callback that it reports its progress to.
+    """
+    told, telling = os.pipe()
     start_s = time.monotonic()
     child = os.fork()
     if child == 0:
-        try:
-            work()
-            os._exit(0)
-        except BaseException as error:
-            print(f"failed: {error}", file=sys.stderr)
-            os._exit(1)
-    while True:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status), time.monotonic() - start_s
-        if kill_after_s is not None and time.monotonic() - start_s >= kill_after_s:
-            os.kill(child, signal.SIGKILL)
-            _, status = os.waitpid(child, 0)
-            return os.waitstatus_to_exitcode(status), time.monotonic() - start_s
-        time.sleep(0.002)
+        os.close(told)
+        _work_and_exit(work, telling)
+    os.close(telling)
+    entered = [(_OPENING, start_s)]
+    code = None
+    with os.fdopen(told, "rb", buffering=0) as stages:
+        while code is None:
+            if select.select([stages], [], [], 0.002)[0]:
+                # one read may hold several names; an empty one is the end
+                for name in stages.read(4096).decode().split("\n")[:-1]:
+                    entered.append((name, time.monotonic()))
+            if kill is not None and _is_time(kill, entered):
+                os.kill(child, signal.SIGKILL)
+                code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+                break
+            done, status = os.waitpid(child, os.WNOHANG)
+            code = os.waitstatus_to_exitcode(status) if done else None
+    ends_s = [since_s for _, since_s in entered[1:]] + [time.monotonic()]
+    took = [(stage, end_s - since_s) for (stage, since_s), end_s in zip(entered, ends_s, strict=True)]
+    return Ended(code, tuple(took))
+
+
+def _is_time(kill: Kill, entered: Sequence[tuple[str, float]]) -> bool:
+    """Whether to kill a process that entered these stages; where it left the stage too soon, at once."""
+    stage, since_s = entered[-1]
+    if stage == kill.stage:
+        return time.monotonic() - since_s >= kill.after_s
+    return any(name == kill.stage for name, _ in entered)
+
+
+def _work_and_exit(work: Callable[[ProgressCallback], None], telling: int) -> None:
+    last = _OPENING
+
+    def tell(state: RunProgress) -> None:
+        nonlocal last
+        stage = stage_of(state)
+        if stage != last:
+            os.write(telling, f"{stage}\n".encode())
+            last = stage
+
+    try:
+        work(tell)
+        os._exit(0)
+    except BaseException as error:
+        print(f"failed: {error}", file=sys.stderr)
+        os._exit(1)
+
+
+def next_kills(
+    lengths_s: Mapping[str, float], tried: Counter[str], count: int, rng: random.Random
+) -> list[Kill]:
+    """The kills of one run: of the stages tried least so far, in the order of the run.
+
+    Args:
+        lengths_s: what each stage took in the unbroken run, in order.
+        tried: kills of each stage so far, those included that fell into the next one.
+        count: at most so many.
+    """
+    stages = [stage for stage, took_s in lengths_s.items() if took_s >= _SHORTEST_S]
+    rank = {stage: (tried[stage], rng.random()) for stage in stages}
+    chosen = set(sorted(stages, key=rank.__getitem__)[:count])
+    return [Kill(stage, rng.uniform(0.0, lengths_s[stage])) for stage in stages if stage in chosen]
 
 
 def load_what_runs_load() -> None:
@@ -74,15 +155,6 @@ def load_what_runs_load() -> None:
     create_depth_model("sensor")  # imports the others as well
     load()
     import_open3d()
-
-
-def stage_of(folder: Path, began: float) -> str:
-    """What a run that began at that time was doing when it was killed, by the files it wrote."""
-    for name, stage in _STAGES:
-        file = folder / name
-        if file.exists() and file.stat().st_mtime >= began:
-            return stage
-    return "opening"
 
 
 def compare(folder: Path, whole: Path) -> dict[str, Any]:
@@ -113,62 +185,70 @@ def kill_runs(
     whole, folder = work / "whole", work / "killed"
     rng = random.Random(seed)
 
-    def begin(place: Path, checkpoint_s: float) -> Callable[[], None]:
-        def do() -> None:
+    def begin(place: Path) -> Callable[[ProgressCallback], None]:
+        def do(tell: ProgressCallback) -> None:
             run(
                 sequence,
                 place,
                 config=settings,
                 max_frames=max_frames,
                 overwrite=True,
-                checkpoint_s=checkpoint_s,
+                checkpoint_s=every_s,
+                progress=tell,
             )
 
         return do
 
-    def go_on() -> None:
-        resume(folder)
+    def go_on(tell: ProgressCallback) -> None:
+        resume(folder, progress=tell)
 
-    in_a_child(begin(whole, every_s), None)  # the first one waits for the disk
-    code, whole_s = in_a_child(begin(whole, every_s), None)
-    if code != 0:
+    in_a_child(begin(whole))  # the first one waits for the disk
+    unbroken = in_a_child(begin(whole))
+    if unbroken.code != 0:
         raise SystemExit("the unbroken run failed")
-    progress_line(f"the unbroken run took {whole_s:.1f} s")
+    lengths_s: dict[str, float] = {}
+    for stage, took_s in unbroken.stages:
+        lengths_s[stage] = lengths_s.get(stage, 0.0) + took_s
+    progress_line(f"the unbroken run took {sum(lengths_s.values()):.1f} s")
     killed: list[dict[str, Any]] = []
+    by_stage: Counter[str] = Counter()
+    tried: Counter[str] = Counter()
     ends: list[dict[str, Any]] = []
     failed = 0
     while len(killed) < kills:
         shutil.rmtree(folder, ignore_errors=True)
-        task, in_a_row = begin(folder, every_s), 0
-        while True:
-            is_deadly = len(killed) < kills and in_a_row < _IN_A_ROW
-            began = time.time()
-            code, took_s = in_a_child(task, rng.uniform(0.0, whole_s) if is_deadly else None)
-            if code != -signal.SIGKILL:
+        task, in_a_row = begin(folder), 0
+        in_order = next_kills(lengths_s, tried, min(_IN_A_ROW, kills - len(killed)), rng)
+        for kill in [*in_order, None]:
+            if kill is not None:
+                tried[kill.stage] += 1
+            ended = in_a_child(task, kill)
+            if ended.code != -signal.SIGKILL:
                 break
             in_a_row += 1
-            stage = stage_of(folder, began)
-            killed.append({"after_s": round(took_s, 2), "during": stage, "frames": _saved(folder)})
+            stage, in_stage_s = ended.stages[-1]
+            by_stage[stage] += 1
+            killed.append({"during": stage, "after_s": round(in_stage_s, 3), "frames": _saved(folder)})
             progress_line(f"kill {len(killed)}: {killed[-1]}")
             if (folder / "checkpoint" / "run.json").is_file():
                 task = go_on
-        if code != 0:
+        if ended.code != 0:
             failed += 1
             continue
         ends.append({"kills": in_a_row, **compare(folder, whole)})
         progress_line(f"end after {in_a_row} kills: {ends[-1]}")
-    stages = [one["during"] for one in killed]
     differences = [end["largest_difference_m"] for end in ends if end["same_frames"]]
     return {
         "sequence": sequence.name,
         "kills": len(killed),
-        "by_stage": {stage: stages.count(stage) for stage in sorted(set(stages))},
+        "by_stage": {stage: by_stage[stage] for stage in lengths_s},
         "runs": len(ends) + failed,
         "lost": failed + sum(not end["same_frames"] for end in ends),
         "runs_with_the_same_bytes": sum(all(end["same_bytes"].values()) for end in ends),
         "runs_with_the_same_trajectory": sum(end["same_bytes"]["trajectory.txt"] for end in ends),
         "largest_difference_m": max(differences, default=None),
-        "unbroken_s": whole_s,
+        "unbroken_s": lengths_s,
+        "killed": killed,
         "ends": ends,
     }
 
@@ -205,7 +285,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.output is not None:
         write_json(options.output, found)
     for name, value in found.items():
-        if name != "ends":
+        if name not in ("ends", "killed"):
             print(f"{name}: {value}")
     return 1 if found["lost"] else 0
 
