@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from command_line import call, leave_out_plots, slamdepth
 from nerfstudio_rules import read_transforms
+from wide_world import wide_camera
 
 import slamdepth as package
 from slamdepth.datasets import Dataset, open_dataset
-from slamdepth.errors import ConfigError, InputError, OutputError
+from slamdepth.errors import ConfigError, DatasetError, InputError, OutputError
 from slamdepth.export import FORMATS, ExportRequest, ExportScene, ImageMode, View, write_export
 from slamdepth.export.formats.euroc import nanoseconds
 from slamdepth.export.images import ExportImages
@@ -301,6 +302,61 @@ def test_a_live_source_is_not_opened_again(tmp_path: Path, source: str) -> None:
     with pytest.raises(InputError, match="live source, whose images are not kept") as told:
         _recording(folder.path, None, None)
     assert "secret" not in str(told.value)
+
+
+def test_a_format_that_fails_stops_no_other(result: RunResult, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(result.folder, run, ignore=shutil.ignore_patterns("export"))
+    (run / "mesh.ply").unlink()
+    done = call("export", run, "--to", "glb,tum,obj,kitti")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "not exported to glb: " in done.stderr
+    assert "not exported to obj: " in done.stderr
+    assert sorted(path.name for path in (run / "export").iterdir()) == ["kitti", "tum"]
+    assert str(run / "export" / "tum") in done.stdout.replace("\n", "")
+
+
+def test_what_fails_for_every_format_is_said_once(tmp_path: Path) -> None:
+    done = call("export", tmp_path, "--to", "tum,kitti")
+    assert done.returncode == 2
+    assert done.stderr.count("is no run folder") == 1
+
+
+def test_an_export_that_fails_leaves_no_folder(result: RunResult, tmp_path: Path, tiny_room: Path) -> None:
+    scene = ExportScene.of(result.reconstruction, "room")
+    dataset = open_dataset(tiny_room)
+
+    def gone(index: int) -> Frame:
+        raise DatasetError("a live source keeps no images")
+
+    dataset.read_original = gone  # type: ignore[method-assign]
+    folder = RunFolder(tmp_path / "run")
+    folder.create()
+    notes = export_results(folder, dataset, [result.reconstruction], [""], ["colmap"], lambda state: None)
+    assert "a live source keeps no images" in notes[0]
+    assert not (folder.path / "export").exists()
+    with pytest.raises(DatasetError):
+        write_export(ExportRequest(scene, dataset), "colmap", tmp_path / "a" / "b" / "out")
+    assert not (tmp_path / "a").exists()
+
+
+def test_raw_images_of_a_wide_lens_are_called_views(tmp_path: Path) -> None:
+    (tmp_path / "wide").mkdir()
+    for number in range(2):
+        cv2.imwrite(str(tmp_path / "wide" / f"{number}.png"), np.full((256, 256, 3), 90 * number, np.uint8))
+    write_camera(tmp_path / "lens.yaml", wide_camera(256))
+    view = open_dataset(tmp_path / "wide", tmp_path / "lens.yaml")
+    frame = view.read(0)
+    scene = ExportScene(
+        "wide", Trajectory(np.zeros(1), np.eye(4)[None]), (View(frame.timestamp_s, np.eye(4)),)
+    )
+    write_export(ExportRequest(scene, view, ImageMode.RAW), "nerfstudio", tmp_path / "out")
+    text = (tmp_path / "out" / "README.txt").read_text()
+    assert "which is not as they were taken" in text
+    assert "undistorted to a pinhole view of" in text
+    camera = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert (camera["w"], camera["h"]) == (frame.camera.width, frame.camera.height)
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:

@@ -33,7 +33,8 @@ def export_command(
         str,
         typer.Option(
             metavar="undistorted|raw|none",
-            help="Images of a pinhole camera with a global shutter, images as they were taken, or none.",
+            help="Images of a pinhole camera with a global shutter, images as they were taken (of a wide "
+            "lens: the pinhole views that were tracked), or none.",
         ),
     ] = "undistorted",
     every_frame: Annotated[
@@ -59,31 +60,43 @@ def export_command(
 
     Example: slamdepth export runs/desk --to colmap --images raw --output desk-colmap
 
-    Each export has a README.txt: frame, unit, scale, and a command to go on with.
+    Each export has a README.txt: frame, unit, scale, and a command to go on with. A format that fails stops
+    no other; the last line names it.
     """
-    from slamdepth.errors import ConfigError
+    from slamdepth.errors import ConfigError, InputError, SlamdepthError
     from slamdepth.pipeline.export import check_exports, export_run
 
     names = export_names(to)
     check_exports(names)
     if not names:
         raise ConfigError("--to names no format; see 'slamdepth export --help'")
+    folders: list[Path] = []
+    errors: dict[str, SlamdepthError] = {}
     with JobBar(quiet) as bar:
-        folders = [
-            export_run(
-                run,
-                name,
-                output if output is None or len(names) == 1 else output / name,
-                images=images,
-                every_frame=every_frame,
-                map_number=map_number,
-                recording=recording,
-                camera=camera,
-                overwrite=overwrite,
-                progress=partial(bar.show, name),
-            )
-            for name in names
-        ]
+        for name in names:
+            try:
+                folder = export_run(
+                    run,
+                    name,
+                    output if output is None or len(names) == 1 else output / name,
+                    images=images,
+                    every_frame=every_frame,
+                    map_number=map_number,
+                    recording=recording,
+                    camera=camera,
+                    overwrite=overwrite,
+                    progress=partial(bar.show, name),
+                )
+            except SlamdepthError as error:
+                errors[name] = error
+            else:
+                folders.append(folder)
     out = console()
     for folder in folders:
         out.print(f"{folder}", markup=False, soft_wrap=True)
+    if not errors:
+        return
+    first = next(iter(errors.values()))
+    if not folders and len({str(error) for error in errors.values()}) == 1:
+        raise first
+    raise InputError("; ".join(f"not exported to {name}: {error}" for name, error in errors.items()))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The images of an export and their camera: undistorted, or as they were taken."""
+"""The images of an export and their camera: undistorted, or as the recording has them."""
 
 from __future__ import annotations
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from slamdepth.datasets.virtual_view import ViewedSequence
 from slamdepth.errors import InputError
 from slamdepth.export.images import ImageMode
 from slamdepth.export.registry import ExportRequest, export_format
@@ -64,7 +65,7 @@ def _readme(request: ExportRequest, name: str, about: str, has_images: bool, lin
     scene = request.scene
     text = [f"{_MARK} of '{scene.name}' to {name}: {about}.", "", *lines, ""]
     if has_images:
-        text += [_IMAGES[request.mode], ""]
+        text += [_about_images(request), ""]
     if scene.gravity_w is None:
         gravity = "The direction of gravity is not known."
     else:
@@ -74,6 +75,15 @@ def _readme(request: ExportRequest, name: str, about: str, has_images: bool, lin
         f"Unit: metres of the run. Scale: {scene.scale}",
     ]
     return "\n".join(text) + "\n"
+
+
+def _about_images(request: ExportRequest) -> str:
+    if request.mode is ImageMode.RAW and isinstance(request.dataset, ViewedSequence):
+        return (
+            f"Images: as the run used them, which is not as they were taken: {request.dataset.view.note}. "
+            "The camera is the pinhole of these views; a rolling shutter is not corrected."
+        )
+    return _IMAGES[request.mode]
 
 
 _IMAGES = {

@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from enum import Enum
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,7 @@ def replacing_folder(folder: str | Path) -> Iterator[Path]:
         OutputError: ``folder`` cannot be written; what was there stays, and nothing else is left behind.
     """
     place = Path(folder).absolute()
+    made = list(takewhile(lambda above: not above.exists(), place.parents))
     partial = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
     before = partial.with_suffix(".before")
     try:
@@ -122,6 +124,9 @@ def replacing_folder(folder: str | Path) -> Iterator[Path]:
                 before.unlink()
             else:
                 shutil.rmtree(before, ignore_errors=True)
+        with suppress(OSError):  # one with something in it stays
+            for above in made if not place.exists() else ():
+                above.rmdir()
 
 
 def write_text(path: str | Path, text: str) -> None:
