@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -23,6 +24,15 @@ HALF, QUARTER = 44, 16
 @pytest.fixture(scope="module")
 def half() -> Map:
     return walk_until(HALF)
+
+
+@lru_cache
+def half_with_images() -> Map:
+    return tracked(frames(range(HALF)), with_images=True)[2]
+
+
+def rmse_m(index: list[int], T_world_camera: Floats) -> float:
+    return float(np.sqrt((errors_m(index, T_world_camera) ** 2).mean()))
 
 
 def errors_m(index: list[int], T_world_camera: Floats) -> Floats:
@@ -49,6 +59,61 @@ def test_frames_are_placed_in_the_map_and_the_map_stays(half: Map) -> None:
     assert all(0.0 < result.quality <= 1.0 for result in results)
     for (group, name), array in before.items():
         np.testing.assert_array_equal(half.groups[group][name], array)
+
+
+@pytest.mark.parametrize("has_images", [False, True])
+def test_frames_that_are_adjusted_together_are_nearer_to_the_truth(has_images: bool) -> None:
+    saved = half_with_images()
+    given = frames(range(HALF, HALF + 12))
+    index = [frame.index for frame in given]
+    with MapLocaliser(half_with_images() if has_images else saved.without_images()) as localiser:
+        for frame in given:
+            localiser.step(frame)
+        placed = localiser.trajectory()
+        landmarks = localiser._map.map.landmarks.position_w.copy()
+        adjusted = localiser.finish()
+        np.testing.assert_array_equal(localiser._map.map.landmarks.position_w, landmarks)
+        np.testing.assert_array_equal(localiser.trajectory().T_world_camera, adjusted.T_world_camera)
+    np.testing.assert_array_equal(adjusted.timestamps_s, placed.timestamps_s)
+    before, after = (rmse_m(index, one.T_world_camera) for one in (placed, adjusted))
+    assert after < 0.95 * before
+
+
+def test_images_of_the_map_make_poses_more_exact() -> None:
+    saved, given = half_with_images(), frames(range(0, COUNT, 6))
+    errors = []
+    for one in (saved.without_images(), saved):
+        with MapLocaliser(one) as localiser:
+            results = {frame.index: localiser.place(frame).T_world_camera for frame in given}
+        found = {index: pose for index, pose in results.items() if pose is not None}
+        errors.append(np.median(errors_m(list(found), np.stack(list(found.values())))))
+    assert errors[1] < 0.8 * errors[0]
+
+
+def test_a_long_recording_is_adjusted_by_some_of_its_frames(
+    half: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from slamdepth.tracking import frame_adjustment
+
+    given = frames(range(HALF, HALF + 12))
+    index = [frame.index for frame in given]
+    found = []
+    for most in (600, 5):
+        monkeypatch.setattr(frame_adjustment, "_MOST", most)
+        with MapLocaliser(half) as localiser:
+            for frame in given:
+                localiser.step(frame)
+            found.append(localiser.finish().T_world_camera)
+    assert rmse_m(index, found[1]) < 1.5 * rmse_m(index, found[0])
+
+
+def test_a_damaged_image_of_the_map_is_named() -> None:
+    saved = half_with_images()
+    images = dict(saved.groups["images"])
+    images["jpeg"] = np.zeros_like(images["jpeg"])
+    damaged = replace(saved, groups={**saved.groups, "images": images})
+    with MapLocaliser(damaged) as localiser, pytest.raises(DatasetError, match="the map's image of frame"):
+        localiser.step(frames([2])[0])
 
 
 def test_a_lost_camera_is_found_again(half: Map) -> None:
@@ -123,6 +188,16 @@ def test_a_run_goes_on_from_a_map_and_extends_it() -> None:
     assert {keyframe.frame.index for keyframe in result.keyframes} <= set(index)
     with MapLocaliser(grown) as localiser:
         assert localiser.place(frames([COUNT - 1])[0]).T_world_camera is not None
+
+
+def test_a_map_that_grows_keeps_the_images_that_it_had() -> None:
+    begun = tracked(frames(range(QUARTER)), with_images=True)[2]
+    grown = tracked(frames(range(QUARTER - 4, COUNT)), begun, with_images=True)[2]
+    was, now = begun.groups["images"], grown.groups["images"]
+    assert len(now["keyframe"]) == len(grown)
+    old = len(was["jpeg"])
+    np.testing.assert_array_equal(now["jpeg"][:old], was["jpeg"])
+    assert not tracked(frames(range(QUARTER - 4, COUNT)), begun)[2].has_images
 
 
 def test_a_run_that_never_meets_its_map_says_so(half: Map) -> None:

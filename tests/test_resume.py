@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import ENVIRONMENT, call, command, leave_out_plots, make_long
+from saved_walk import tracked
 from tracking_scene import CAMERA, CONFIG, COUNT, ConstantDepth, colour_only, frames, walk
 
-from slamdepth import Config, DepthPrediction, Frame, StoredFrame, Tracker
+from slamdepth import Config, DepthPrediction, Frame, Session, StoredFrame, Tracker
 from slamdepth.depth.base import DepthModel
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import OutputError
@@ -69,6 +70,34 @@ def test_a_restored_tracker_goes_on_as_the_first_one_would_have(
         np.testing.assert_array_equal(again.points_m, ended.points_m)
         assert again.statistics.loop_closures == ended.statistics.loop_closures
         assert again.statistics.readout_s == ended.statistics.readout_s
+
+
+def test_a_tracker_restored_in_a_map_with_images_has_them_still() -> None:
+    begun = tracked(frames(range(16)), with_images=True)[2]
+    given = frames(range(12, COUNT))
+    first = Tracker(CAMERA, SensorDepth(), CONFIG, start_map=begun)
+    saved: tuple[int, bytes] | None = None
+    for n, frame in enumerate(given):
+        first.step(frame)
+        if saved is None and n > 10 and first.is_quiet:
+            plain, arrays = flattened(first.state())
+            saved = n + 1, encode_tensors(arrays, {"tree": plain})
+    assert saved is not None
+    done, data = saved
+    second = Tracker(CAMERA, SensorDepth(), CONFIG, start_map=begun)
+    arrays, about = decode_tensors(data)
+    second.restore(
+        restored(about["tree"], arrays), read_frame, lambda frame: SensorDepth().predict(frame.load())
+    )
+    for frame in given[done:]:
+        second.step(frame)
+    one, other = (
+        tracker.saved_map(0, tracker.finish(), Session("walk", "sensor"), {}, with_images=True)
+        for tracker in (first, second)
+    )
+    assert (one.groups["keyframes"]["session"] == 0).any()
+    for name, array in one.groups["images"].items():
+        np.testing.assert_array_equal(other.groups["images"][name], array)
 
 
 def test_results_of_frames_come_back_from_arrays() -> None:

@@ -40,7 +40,7 @@ def encode_image(image_rgb: NDArray[np.uint8]) -> Encoded:
     import cv2
 
     _, data = cv2.imencode(".jpg", image_rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    return Encoded(data.tobytes(), _decode_image)
+    return Encoded(data.tobytes(), decode_image)
 
 
 def encode_sensor_depth(depth_m: NDArray[np.float32], units_per_m: float) -> Encoded:
@@ -64,11 +64,17 @@ def encode_half_precision(values: NDArray[np.floating]) -> Encoded:
     return Encoded(_encode_png(words), partial(decode_half_precision, dtype=values.dtype))
 
 
-def _decode_image(data: bytes) -> NDArray[np.uint8]:
+def decode_image(data: bytes) -> NDArray[np.uint8]:
+    """What :func:`encode_image` was given, ``(H, W, 3)`` RGB, as far as the JPEG keeps it.
+
+    Raises:
+        ValueError: it does not decode.
+    """
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        raise ValueError("the image does not decode")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 

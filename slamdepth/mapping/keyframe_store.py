@@ -12,8 +12,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from slamdepth.errors import TrackingError
-from slamdepth.mapping.codec import Encoded, encode_half_precision, encode_image, encode_sensor_depth
+from slamdepth.errors import DatasetError, TrackingError
+from slamdepth.mapping.codec import (
+    Encoded,
+    decode_image,
+    encode_half_precision,
+    encode_image,
+    encode_sensor_depth,
+)
 from slamdepth.mapping.spill_file import SpilledArray, SpillFile
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
 
@@ -34,9 +40,9 @@ class StoredFrame:
         self.index, self.timestamp_s = frame.index, frame.timestamp_s
         self.camera, self.gravity = frame.camera, frame.gravity
         self._resident: Frame | None = frame
-        self._jpeg: Encoded | None = None  # of a resident image, once it was asked for: a tenth of its size
         self._image: SpilledArray | None = None
         self._depth: SpilledArray | None = None
+        self._jpeg: Encoded | None = None  # of a saved map, or of a resident image once it was asked for
         self._read: Callable[[], Frame] | None = None
 
     @classmethod
@@ -47,16 +53,19 @@ class StoredFrame:
         camera: Camera,
         gravity: NDArray[np.float64] | None = None,
         read: Callable[[], Frame] | None = None,
+        jpeg: bytes | None = None,
     ) -> StoredFrame:
         """Handle of a frame of a saved map or of an earlier process.
 
         Args:
-            read: reads the frame; None where its image was not kept.
+            read: reads the frame of an earlier process.
+            jpeg: the image that a saved map has of it; None where it was not kept.
         """
         stored = cls.__new__(cls)
         stored.index, stored.timestamp_s, stored.camera, stored.gravity = index, timestamp_s, camera, gravity
-        stored._resident = stored._jpeg = stored._image = stored._depth = None
+        stored._resident = stored._image = stored._depth = None
         stored._read = read
+        stored._jpeg = None if jpeg is None else Encoded(jpeg, stored._decoded)
         return stored
 
     @property
@@ -66,7 +75,8 @@ class StoredFrame:
     @property
     def is_kept(self) -> bool:
         """Whether :meth:`load` can give the frame."""
-        return not (self._resident is None and self._image is None and self._read is None)
+        kept = (self._resident, self._image, self._jpeg, self._read)
+        return any(one is not None for one in kept)
 
     def load(self) -> Frame:
         """The frame; where it was spilled, read from the file each time.
@@ -75,11 +85,15 @@ class StoredFrame:
 
         Raises:
             TrackingError: it belongs to a map that was saved without images.
+            DatasetError: the image that the map has is damaged.
         """
         if (frame := self._resident) is not None:
             return frame
         if self._read is not None:
             return self._read()
+        if self._jpeg is not None:
+            image_rgb = self._jpeg.array()
+            return Frame(self.index, self.timestamp_s, image_rgb, self.camera, gravity=self.gravity)
         if self._image is None:
             raise TrackingError(f"the image of frame {self.index} was not saved with the map")
         depth_m = None if self._depth is None else self._depth.load()
@@ -99,14 +113,24 @@ class StoredFrame:
         return np.asarray(self._encoded().array())
 
     def _encoded(self) -> Encoded:
-        if self._resident is None and self._image is not None:
-            return self._image.encoded()
         if self._jpeg is not None:
             return self._jpeg
+        if self._resident is None and self._image is not None:
+            return self._image.encoded()
         jpeg = encode_image(self.load().image_rgb)
         if self._resident is not None:
             self._jpeg = jpeg
         return jpeg
+
+    def _decoded(self, jpeg: bytes) -> NDArray[np.uint8]:
+        """The image that a saved map has; raises DatasetError where it is damaged."""
+        try:
+            image_rgb = decode_image(jpeg)
+        except ValueError as error:
+            raise DatasetError(f"the map's image of frame {self.index} is damaged: {error}") from error
+        if image_rgb.shape[:2] != (self.camera.height, self.camera.width):
+            raise DatasetError(f"the map's image of frame {self.index} is damaged: it has another size")
+        return image_rgb
 
     def _spill(self, file: SpillFile) -> None:
         """Move the images to ``file``."""

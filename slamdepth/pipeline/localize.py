@@ -153,7 +153,7 @@ def localize(
                 frame = item.frame if item.frame.camera == used else replace(item.frame, camera=used)
                 steps.append(localiser.step(frame, item.prepared))
                 tell(len(steps) + skipped, len(indices), steps[-1])
-        trajectory, quality = localiser.trajectory(), localiser.quality()
+        trajectory, quality = localiser.finish(), localiser.quality()
     if not steps:
         raise DatasetError(f"{path}: none of the {len(indices)} images decodes")
     if len(steps) + skipped < len(indices):
@@ -176,7 +176,10 @@ def _until(reader: FramePrefetcher, stop: Callable[[], bool] | None) -> Iterator
 def _settled(
     steps: list[StepResult], trajectory: Trajectory, quality: NDArray[np.float64]
 ) -> tuple[StepResult, ...]:
-    """The results with poses that later frames confirmed, and without those that they contradicted."""
+    """The results with the poses of ``trajectory``, those that later frames confirmed among them.
+
+    Frames that it does not have are lost: later frames contradicted their poses.
+    """
     poses = zip(trajectory.T_world_camera, quality.tolist(), strict=True)
     found = dict(zip(trajectory.timestamps_s.tolist(), poses, strict=True))
     settled = []
@@ -185,11 +188,11 @@ def _settled(
             step = replace(
                 step, status=TrackingStatus.LOST, T_world_camera=None, inliers=0, quality=0.0, covariance=None
             )
-        elif step.T_world_camera is None:
+        else:
             T_world_camera, sure = found[step.timestamp_s]
-            step = replace(
-                step, status=TrackingStatus.RELOCALISED, T_world_camera=T_world_camera, quality=sure
-            )
+            if step.T_world_camera is None:
+                step = replace(step, status=TrackingStatus.RELOCALISED, quality=sure)
+            step = replace(step, T_world_camera=T_world_camera)
         settled.append(step)
     return tuple(settled)
 

@@ -18,10 +18,10 @@ from slamdepth.io.tree import Tree
 from slamdepth.mapping.map import Map
 from slamdepth.mapping.map_keyframe import AnchoredPose
 from slamdepth.mapping.placement import Placement
+from slamdepth.tracking.frame_sights import FEWEST_SIGHTS, FrameSights
 from slamdepth.types import Camera, Frame, Trajectory
 from slamdepth.typing import Bools, Floats, Floats32, Ints
 
-_MIN_MATCHES = 30
 _MAX_GAP_S = 0.2  # frames farther apart say little of the velocity between them
 _PRUNE_AT = 256  # frames, then always twice as many
 _REMEMBERED = 18_000  # latest frames, ten minutes, whose matches are kept: 5.5 KiB each
@@ -115,7 +115,7 @@ class FrameLog:
         reference = self._map.keyframes[-1]
         seen = placement.landmark_ids
         shared = np.count_nonzero(np.isin(reference.landmark_ids, placement.found_ids))
-        if not is_keyframe and shared < _MIN_MATCHES:
+        if not is_keyframe and shared < FEWEST_SIGHTS:
             best = self._map.covisible(seen, 1)
             reference = self._map.keyframes[best[0]] if best else reference
         # a keyframe's pose is the map's own, whatever it saw
@@ -306,36 +306,64 @@ class FrameLog:
             velocity = velocities[n] if readout_s else None
             self._refine(placed, self._map.resolve(self._now(placed.landmark_ids)), velocity, readout_s)
 
+    def sights(self, n: int, readout_s: float) -> FrameSights:
+        """What the ``n``-th frame sees of the landmarks that are there still.
+
+        Args:
+            readout_s: see :meth:`refine`.
+        """
+        placed = self._placed[n]
+        ids = self._map.resolve(self._now(placed.landmark_ids))
+        velocity = self._velocity(n) if readout_s else None
+        return self._sights(placed, ids, np.flatnonzero(ids >= 0), velocity, readout_s)
+
+    def _sights(
+        self, placed: _Placed, ids: Ints, at: Ints, velocity: Floats | None, readout_s: float
+    ) -> FrameSights:
+        """What a frame sees, of the landmarks ``ids`` those ``at``."""
+        points_w = self._map.landmarks.position_w[ids[at]]
+        T_camera_world = placed.pose.T_camera_world
+        px = placed.px[at].astype(np.float64)
+        if velocity is not None:
+            inverse = inverse_depth(T_camera_world, points_w)
+            phase = placed.phase[at].astype(np.float64)
+            px = at_middle_row(self._camera, px, phase, inverse, velocity, readout_s)
+        return FrameSights(T_camera_world, ids[at], points_w, px, placed.sigma_px[at].astype(np.float64))
+
     def _refine(self, placed: _Placed, ids: Ints, velocity: Floats | None, readout_s: float) -> None:
         landmarks = self._map.landmarks
         good = np.flatnonzero(ids >= 0)
         good = good[landmarks.observations[ids[good]] >= 2]
-        if len(good) < _MIN_MATCHES:
+        if len(good) < FEWEST_SIGHTS:
             return
-        points_w = landmarks.position_w[ids[good]]
-        start = placed.pose.T_camera_world
-        px = placed.px[good].astype(np.float64)
-        if velocity is not None:
-            inverse = inverse_depth(start, points_w)
-            phase = placed.phase[good].astype(np.float64)
-            px = at_middle_row(self._camera, px, phase, inverse, velocity, readout_s)
+        sights = self._sights(placed, ids, good, velocity, readout_s)
         estimate = refine_pose(
             self._camera,
-            start,
-            points_w,
+            sights.T_camera_world,
+            sights.points_w,
             landmarks.covariance_w[ids[good]],
-            px,
-            placed.sigma_px[good].astype(np.float64),
+            sights.px,
+            sights.sigma_px,
             rounds=2,
             iterations=2,
         )
-        if np.count_nonzero(estimate.inliers) < 0.5 * len(good):
-            return
-        center_w = invert(start)[:3, 3]
-        distance = float(np.median(np.linalg.norm(points_w - center_w, axis=1)))
-        moved = np.linalg.norm(invert(estimate.T_camera_world)[:3, 3] - center_w)
+        if np.count_nonzero(estimate.inliers) >= 0.5 * len(good):
+            self._move(placed, estimate.T_camera_world, sights)
+
+    def move(self, n: int, T_camera_world: Floats, sights: FrameSights) -> None:
+        """Give the ``n``-th frame a better pose ``(4, 4)``, unless it is nowhere near the one before.
+
+        Args:
+            sights: of the frame.
+        """
+        self._move(self._placed[n], T_camera_world, sights)
+
+    def _move(self, placed: _Placed, T_camera_world: Floats, sights: FrameSights) -> None:
+        center_w = invert(sights.T_camera_world)[:3, 3]
+        distance = float(np.median(np.linalg.norm(sights.points_w - center_w, axis=1)))
+        moved = np.linalg.norm(invert(T_camera_world)[:3, 3] - center_w)
         if moved < _MAX_SHIFT_SHARE * distance:
-            placed.pose = AnchoredPose.of(estimate.T_camera_world, placed.pose.keyframe)
+            placed.pose = AnchoredPose.of(T_camera_world, placed.pose.keyframe)
 
     @property
     def quality(self) -> Floats:

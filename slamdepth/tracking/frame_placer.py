@@ -29,7 +29,8 @@ class Found:
     """Where a frame was found.
 
     Attributes:
-        raw, features: of the frame, as extracted and corrected for a rolling shutter.
+        raw, features: of the frame, as extracted, or aligned to the map's images, and as extracted and
+            corrected for a rolling shutter.
         placement: its pose.
         placed_by: how it was found first.
     """
@@ -71,14 +72,16 @@ class FramePlacer:
             placed_by = placement.placed_by
             features, placement = self._correct_by_pose(frame, raw, features, placement)
             self._measure_step(placement)
-        return Found(raw, features, placement, placed_by)
+            return self._aligned(frame, Found(raw, features, placement, placed_by))
 
     def find(self, frame: Frame, raw: Features) -> Found | None:
         """Place a frame by what it looks like, where the camera was in another map."""
         with self._watch.timed("tracking"):
             placement = self._parts.relocaliser.by_place(raw)
             placement = self._count(frame, raw, placement)
-        return None if placement is None else Found(raw, raw, placement, placement.placed_by)
+            if placement is None:
+                return None
+            return self._aligned(frame, Found(raw, raw, placement, placement.placed_by))
 
     def _place(self, frame: Frame, features: Features) -> Placement | None:
         """Every usual way to place a frame by its features, the cheapest first; None where it is lost."""
@@ -123,6 +126,20 @@ class FramePlacer:
         """Place a frame by registering its depth; the last and dearest way."""
         found = self._parts.relocaliser.by_registration(frame, features, self._guess(frame))
         return self._count(frame, features, found)
+
+    def _aligned(self, frame: Frame, found: Found) -> Found:
+        """Align what a frame sees in the map's images, where it has any, and place the frame by that.
+
+        Landmarks and their deviations stay those of the detected keypoints, which say how sure the pose is.
+        """
+        if self._parts.aligner is None:
+            return found
+        placement = found.placement
+        raw = self._parts.aligner(frame, found.raw, placement)
+        corrected = self._parts.shutter.correct_by_pose(raw, self._parts.motion, frame.timestamp_s, placement)
+        refined = self._parts.localiser.reoptimise(corrected or raw, placement)
+        placement = replace(placement, T_camera_world=refined.T_camera_world)
+        return replace(found, raw=raw, placement=placement)
 
     def _count(self, frame: Frame, features: Features, placement: Placement | None) -> Placement | None:
         """Count what a found placement saw; None where there is none, or it is not earned."""

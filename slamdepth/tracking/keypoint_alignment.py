@@ -23,7 +23,7 @@ from slamdepth.typing import Bools, Floats, Ints
 
 log = logging.getLogger(__name__)
 
-_SHARE = 0.25
+ALIGNED_SHARE = 0.25
 """An aligned keypoint's deviation over a detected one's."""
 _LEAST_CORRELATION = 0.85
 _FARTHEST = 2.5  # deviations of a detected keypoint
@@ -40,7 +40,7 @@ def align_keypoints(map_: Map, shutter: RollingShutter, levels: ScaleLevels) -> 
     Returns:
         How many observations were aligned.
     """
-    references = _References.of(map_)
+    references = References.of(map_)
     keypoints = [_Keypoints.of(keyframe) for keyframe in map_.keyframes]
     count = 0
     for landmark_ids in references.batches():
@@ -49,7 +49,7 @@ def align_keypoints(map_: Map, shutter: RollingShutter, levels: ScaleLevels) -> 
             keypoints = [aligned.result() for aligned in aligning]
     for found in keypoints:
         keyframe, features = found.keyframe, found.features
-        sigma_px = levels.sigma_px(features.octave) * np.where(found.is_aligned, _SHARE, 1.0)
+        sigma_px = levels.sigma_px(features.octave) * np.where(found.is_aligned, ALIGNED_SHARE, 1.0)
         px = keyframe.frame.camera.undistort_points(found.raw_px)
         map_.set_features(keyframe, replace(features, raw_px=found.raw_px, px=px, sigma_px=sigma_px))
         count += int(np.count_nonzero(found.is_aligned))
@@ -59,11 +59,11 @@ def align_keypoints(map_: Map, shutter: RollingShutter, levels: ScaleLevels) -> 
 
 
 @dataclass(frozen=True)
-class _References:
+class References:
     """The view of each landmark that the others are aligned to.
 
     Attributes:
-        keyframe, feature: ``(P,)`` of the view, -1 where fewer than two keyframes see the landmark.
+        keyframe, feature: ``(P,)`` of the view, -1 where too few keyframes see the landmark.
         observations: number of all views of these landmarks.
     """
 
@@ -72,9 +72,13 @@ class _References:
     observations: int
 
     @classmethod
-    def of(cls, map_: Map) -> _References:
-        """The view of each landmark nearest to the mean direction it is seen from."""
-        size, keyframes, often = map_.size, map_.keyframes, map_.seen_by(2)
+    def of(cls, map_: Map, views: int = 2) -> References:
+        """The view of each landmark nearest to the mean direction it is seen from.
+
+        Args:
+            views: keyframes that see it, at least.
+        """
+        size, keyframes, often = map_.size, map_.keyframes, map_.seen_by(views)
         seen = [_seen(keyframe) for keyframe in keyframes]
         directions = [
             _unit(keyframe.center_w - map_.landmarks.position_w[ids])
@@ -137,13 +141,13 @@ class _Batch:
     """
 
     map_: Map
-    references: _References
+    references: References
     T_camera_world: Floats
     place: Ints
     templates: Templates
 
     @classmethod
-    def of(cls, map_: Map, references: _References, landmark_ids: Ints) -> _Batch:
+    def of(cls, map_: Map, references: References, landmark_ids: Ints) -> _Batch:
         """The landmarks ``landmark_ids``, which are ordered by the keyframe of their view."""
         place = np.full(map_.size, -1)
         place[landmark_ids] = np.arange(len(landmark_ids))
@@ -183,12 +187,29 @@ class _Batch:
             self.map_.landmarks.position_w[ids],
             np.array([camera.fx, camera.fy]),
         )
-        px, correlation = align(image, self.templates.taken(self.place[ids]), warp, keypoints.raw_px[at])
-        zoom = np.sqrt(np.abs(np.linalg.det(warp)))
-        way = np.linalg.norm(px - keypoints.raw_px[at], axis=1) / keypoints.features.sigma_px[at]
-        good = (correlation > _LEAST_CORRELATION) & (way < _FARTHEST)
-        good &= (zoom < _MOST_ZOOM) & (zoom > 1.0 / _MOST_ZOOM)
+        templates, sigma_px = self.templates.taken(self.place[ids]), keypoints.features.sigma_px[at]
+        px, good = aligned(image, templates, warp, keypoints.raw_px[at], sigma_px)
         return keypoints.moved(at[good], px[good])
+
+
+def aligned(
+    image: ImagePyramid, templates: Templates, warp: Floats, raw_px: Floats, sigma_px: Floats
+) -> tuple[Floats, Bools]:
+    """Keypoints aligned to the patches of other views, and which of them can be believed.
+
+    Args:
+        warp: ``(N, 2, 2)`` from offsets in those views to offsets in this image.
+        raw_px: ``(N, 2)`` where they were detected, with deviations ``sigma_px (N,)``.
+
+    Returns:
+        Pixels ``(N, 2)``, and ``(N,)`` where the patches agree near the detected keypoint.
+    """
+    px, correlation = align(image, templates, warp, raw_px)
+    zoom = np.sqrt(np.abs(np.linalg.det(warp)))
+    way = np.linalg.norm(px - raw_px, axis=1) / sigma_px
+    good = (correlation > _LEAST_CORRELATION) & (way < _FARTHEST)
+    good &= (zoom < _MOST_ZOOM) & (zoom > 1.0 / _MOST_ZOOM)
+    return px, np.asarray(good, np.bool_)
 
 
 def _seen(keyframe: MapKeyframe) -> tuple[Ints, Ints]:

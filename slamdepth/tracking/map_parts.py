@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 
 from slamdepth.config import Config
@@ -13,7 +13,7 @@ from slamdepth.frontend.features import Features, ScaleLevels
 from slamdepth.io.tree import Tree
 from slamdepth.mapping.keyframe_store import StoredFrame
 from slamdepth.mapping.map import Map
-from slamdepth.mapping.placement import PlacedBy
+from slamdepth.mapping.placement import PlacedBy, Placement
 from slamdepth.stopwatch import Stopwatch
 from slamdepth.tracking.frame_log import FrameLog
 from slamdepth.tracking.integration import KeyframeIntegration
@@ -66,10 +66,12 @@ class StoredKeyframes:
     Attributes:
         read_frame: reads a frame of the sequence by its index.
         read_prediction: reads the prediction that was made for a frame.
+        images: JPEGs of the map that the run goes on from, by recording and frame.
     """
 
     read_frame: Callable[[int], Frame]
     read_prediction: Callable[[StoredFrame], DepthPrediction]
+    images: Mapping[tuple[int, int], bytes] = field(default_factory=dict)
 
 
 class MapParts:
@@ -85,6 +87,7 @@ class MapParts:
         placed_by: how many frames were placed by what.
         past: frames of earlier recordings, where the map was loaded.
         is_loaded: the map, or a part of it, is of an earlier recording.
+        aligner: aligns what placed frames see in the map's images; None leaves it as it was detected.
     """
 
     def __init__(self, id_: int, run: RunParts) -> None:
@@ -119,6 +122,7 @@ class MapParts:
         self.placed_by: Counter[PlacedBy] = Counter()
         self.past = PastFrames()
         self.is_loaded = False
+        self.aligner: Callable[[Frame, Features, Placement], Features] | None = None
 
     def state(self) -> Tree:
         """Everything the map and its parts remember, for a checkpoint; no keyframe is between stages."""
@@ -159,8 +163,11 @@ class MapParts:
         def frame_of(number: int, index: int, timestamp_s: float, gravity: Floats | None) -> StoredFrame:
             if number in waiting:
                 return StoredFrame(stored.read_frame(index))
-            reader = partial(stored.read_frame, index) if sessions[number] == session else None
-            return StoredFrame.of_saved(index, timestamp_s, self._run.camera, gravity, reader)
+            if sessions[number] == session:
+                reader = partial(stored.read_frame, index)
+                return StoredFrame.of_saved(index, timestamp_s, self._run.camera, gravity, reader)
+            jpeg = stored.images.get((int(sessions[number]), index))
+            return StoredFrame.of_saved(index, timestamp_s, self._run.camera, gravity, jpeg=jpeg)
 
         states = keyframe_states(state["keyframes"], metric_of(state["metric"]), frame_of, read)
         about = state["map"]

@@ -31,6 +31,7 @@ from slamdepth.tracking.map_arrays import (
 from slamdepth.tracking.map_parts import MapParts
 from slamdepth.tracking.past_frames import PastFrames
 from slamdepth.types import Camera
+from slamdepth.typing import Floats
 
 _SAME = ("name", "levels", "scale_factor")
 """Settings of features that have to be those of the map."""
@@ -164,12 +165,13 @@ def load_map(saved: SavedMap, into: MapParts, camera: Camera, features: FeatureC
     is_same = same_lens(saved.camera, camera)
     if not is_same:
         arrays = _seen_by(arrays, saved.camera, camera)
-    states = keyframe_states(
-        arrays,
-        metric_of(saved.metric),
-        lambda number, frame, timestamp_s, gravity: StoredFrame.of_saved(frame, timestamp_s, camera, gravity),
-        lambda number, stored: None,
-    )
+    images, session = _images_for(camera, saved), arrays["session"].tolist()
+
+    def frame_of(number: int, index: int, timestamp_s: float, gravity: Floats | None) -> StoredFrame:
+        jpeg = images.get((session[number], index))
+        return StoredFrame.of_saved(index, timestamp_s, camera, gravity, jpeg=jpeg)
+
+    states = keyframe_states(arrays, metric_of(saved.metric), frame_of, lambda number, stored: None)
     first_of_run = len(states)
     into.map.restore(states, landmarks_of(saved.groups["landmarks"]), {*saved.starts, first_of_run})
     into.map.session = len(saved.sessions)
@@ -185,6 +187,19 @@ def load_map(saved: SavedMap, into: MapParts, camera: Camera, features: FeatureC
         into.shutter.go_on_from(*saved.shutter, first_of_run)
     into.past.restore(saved.groups["frames"], into.map.keyframes)
     into.is_loaded = True
+
+
+def _images_for(camera: Camera, saved: SavedMap) -> dict[tuple[int, int], bytes]:
+    """The JPEGs that a map has, by recording and frame; none where ``camera`` has another lens."""
+    if not saved.has_images or not same_lens(saved.camera, camera):
+        return {}
+    images, keyframes = saved.groups["images"], saved.groups["keyframes"]
+    first = images["first_byte"].tolist()
+    session, frame = keyframes["session"].tolist(), keyframes["frame"].tolist()
+    return {
+        (session[k], frame[k]): images["jpeg"][first[n] : first[n + 1]].tobytes()
+        for n, k in enumerate(images["keyframe"].tolist())
+    }
 
 
 def with_features_of(saved: SavedMap, config: Config | None) -> Config:

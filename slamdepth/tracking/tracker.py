@@ -79,6 +79,7 @@ class Tracker:
         self._wide_features = WideFeatures(camera, config.features, self._watch)
         self._workers = Workers(DepthWorker(model, self._watch, with_uncertainty=config.depth.uncertainty))
         self._earlier: tuple[Session, ...] = ()
+        self._start_images: dict[tuple[int, int], bytes] = {}
         self._atlas = Atlas(self._new_map, config)
         if start_map is not None:
             self._go_on_from(start_map, is_measured=is_sensor(model))
@@ -106,6 +107,11 @@ class Tracker:
             )
         load_map(saved, self._active, self.camera, self.config.features)
         self._earlier = saved.sessions
+        self._start_images = {
+            (keyframe.session, keyframe.frame.index): keyframe.frame.image_bytes()
+            for keyframe in self._active.map.keyframes
+            if keyframe.frame.is_kept
+        }
 
     @property
     def is_in_start_map(self) -> bool:
@@ -255,7 +261,7 @@ class Tracker:
             read_frame: reads a frame that became a keyframe, by its index.
             read_prediction: reads the depth that was predicted for it.
         """
-        stored = StoredKeyframes(read_frame, read_prediction)
+        stored = StoredKeyframes(read_frame, read_prediction, self._start_images)
         self._earlier = tuple(Session(**session) for session in state["earlier"])
         self._atlas.restore(state["atlas"], stored)
         self._steps, self._last_time_s = state["steps"], state["last_time_s"]
