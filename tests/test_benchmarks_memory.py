@@ -41,7 +41,8 @@ def test_a_short_run(tiny_room: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     written = json.loads(found.read_text(encoding="utf-8"))
     assert [s["frames"] for s in written["samples"]] == [40, 80, 90]
     assert written["figures"]["lost"] == 0
-    assert written["figures"]["peak_mib"] > written["samples"][-1]["process_mib"] - 1.0 > 0  # two clocks of the kernel
+    # the kernel counts the two separately
+    assert written["figures"]["peak_mib"] > written["samples"][-1]["process_mib"] - 1.0 > 0
     last = written["samples"][-1]["tracker"]
     assert all(value > 0 for value in last.values()), last
     assert "| 90 | " in capsys.readouterr().out
