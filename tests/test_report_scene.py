@@ -110,6 +110,9 @@ def test_a_damaged_or_foreign_or_newer_file_is_refused_by_name(tmp_path: Path) -
     save_file({"a": np.zeros(1)}, path, {"slamdepth": "[]"})
     with pytest.raises(DatasetError, match="is no scene"):
         read_scene(path)
+    save_file({"a": np.zeros(1)}, path, {"slamdepth": "[" * 100_000})  # too deeply nested to be decoded
+    with pytest.raises(DatasetError, match=r"scene\.safetensors: cannot be read"):
+        read_scene(path)
     scene = room_scene()
     write_scene(path, replace(scene, maps=(replace(scene.maps[0], loops=np.array([[0, 6]])),)))
     with pytest.raises(DatasetError, match=r"scene\.safetensors: cannot be read: 1/loops names a keyframe"):

@@ -52,7 +52,7 @@ def decode_tensors(data: bytes, key: str = "about") -> tuple[dict[str, NDArray[A
         length = int.from_bytes(data[:8], "little")
         text = json.loads(data[8 : 8 + length]).get("__metadata__", {}).get(key)
         about = {} if text is None else json.loads(text)
-    except (SafetensorError, ValueError, KeyError, AttributeError, TypeError) as error:
+    except (SafetensorError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise ValueError(f"no safetensors file: {error}") from error
     return arrays, about
 
