@@ -7,6 +7,7 @@ import csv
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from bags import BagWriter
@@ -103,6 +104,18 @@ def test_one_image_is_placed_with_the_camera_of_the_map(
     assert "position in the map" in done.stdout
     assert "intrinsics are those of the map's camera" in done.stdout
     assert len(read_tum_trajectory(tmp_path / "one" / "trajectory.txt")[0]) == 1
+    assert "not aligned" not in done.stdout
+
+
+def test_an_image_of_another_size_is_said_not_to_be_aligned(
+    run_folder: Path, tiny_room: Path, tmp_path: Path
+) -> None:
+    own = Map.load(run_folder).camera
+    image = cv2.imread(str(images(tiny_room)[12]))
+    cv2.imwrite(str(tmp_path / "small.png"), cv2.resize(image, (own.width // 2, own.height // 2)))
+    done = call("localize", "--map", run_folder, tmp_path / "small.png", "-o", tmp_path / "one")
+    assert done.returncode == 0, done.stderr
+    assert "keypoints are not aligned in the map's images" in done.stdout
 
 
 def test_one_image_of_a_wide_lens_is_placed(run_folder: Path, tiny_room: Path, tmp_path: Path) -> None:

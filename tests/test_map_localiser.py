@@ -15,6 +15,7 @@ from slamdepth import Map, MapLocaliser, Tracker
 from slamdepth.depth.sensor import SensorDepth
 from slamdepth.errors import DatasetError, TrackingError
 from slamdepth.geometry import invert
+from slamdepth.tracking.saved_maps import same_lens
 from slamdepth.types import Camera, Frame, TrackingStatus
 from slamdepth.typing import Floats
 
@@ -114,6 +115,21 @@ def test_a_damaged_image_of_the_map_is_named() -> None:
     damaged = replace(saved, groups={**saved.groups, "images": images})
     with MapLocaliser(damaged) as localiser, pytest.raises(DatasetError, match="the map's image of frame"):
         localiser.step(frames([2])[0])
+
+
+def test_a_camera_that_was_scaled_to_the_size_of_the_map_is_that_of_the_map() -> None:
+    saved = half_with_images()
+    camera = replace(saved.camera, fx=517.3, fy=516.5, cx=318.6, cy=255.3)
+    scaled = camera.scaled(4032, 3024).scaled(camera.width, camera.height)
+    assert scaled != camera  # by rounding
+    assert same_lens(scaled, camera)
+    assert not same_lens(replace(camera, fx=camera.fx + 0.01), camera)
+    assert not same_lens(replace(camera, width=camera.width + 1), camera)
+    again = saved.camera.scaled(4032, 3024).scaled(saved.camera.width, saved.camera.height)
+    with MapLocaliser(saved, again) as localiser:
+        assert localiser.has_images
+    with MapLocaliser(saved, replace(again, fx=again.fx + 1.0)) as localiser:
+        assert not localiser.has_images
 
 
 def test_a_lost_camera_is_found_again(half: Map) -> None:

@@ -79,6 +79,11 @@ class MapLocaliser:
         self._closed = False
         load()
 
+    @property
+    def has_images(self) -> bool:
+        """Whether the map has images of this camera, in which keypoints are aligned."""
+        return self._map.aligner is not None
+
     def prepare(self, frame: Frame) -> Prepared:
         """The features of a frame, which another thread may find ahead of :meth:`step`."""
         return self._prepare(frame)

@@ -35,6 +35,7 @@ from slamdepth.typing import Floats
 
 _SAME = ("name", "levels", "scale_factor")
 """Settings of features that have to be those of the map."""
+_SAME_PX = 1e-6  # far below what any camera is known to, far above rounding
 
 
 @dataclass(frozen=True)
@@ -228,8 +229,10 @@ def check_features(saved: SavedMap, features: FeatureConfig) -> None:
 
 
 def same_lens(a: Camera, b: Camera) -> bool:
-    """Whether two cameras show the same world in the same pixels."""
-    return replace(a, fps=b.fps, depth_factor=b.depth_factor) == b
+    """Whether two cameras show the same world in the same pixels, but for rounding where one was scaled."""
+    off_px = np.abs([a.fx - b.fx, a.fy - b.fy, a.cx - b.cx, a.cy - b.cy])
+    a = replace(a, fx=b.fx, fy=b.fy, cx=b.cx, cy=b.cy, fps=b.fps, depth_factor=b.depth_factor)
+    return a == b and bool((off_px < _SAME_PX).all())
 
 
 def vocabulary_sha256(vocabulary: Vocabulary) -> str:
