@@ -150,6 +150,25 @@ def test_a_run_goes_on_from_the_map(
     assert "that of the map it goes on from" in report["scale"]["sentence"]
 
 
+def test_images_of_a_map_that_another_camera_took_are_said_to_be_left_out(
+    run_folder: Path, tiny_room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave_out_plots(monkeypatch)
+    lens = (tiny_room / "camera.yaml").read_text().splitlines()
+    moved = [
+        f"fx: {Map.load(run_folder).camera.fx + 0.5}" if line.startswith("fx:") else line for line in lens
+    ]
+    (tmp_path / "camera.yaml").write_text("\n".join(moved))
+    given = ("--map", run_folder, "--depth", "sensor", "--no-mesh", "--map-images", "--max-frames", 10)
+    for camera, is_said in ((tiny_room / "camera.yaml", False), (tmp_path / "camera.yaml", True)):
+        out = tmp_path / str(is_said)
+        done = call("run", tiny_room, *given, "--camera", camera, "--output", out)
+        assert done.returncode == 0, done.stderr
+        report = json.loads((out / "report.json").read_text())
+        assert any("images of the map" in note for note in report["notes"]) is is_said
+        assert Map.load(out).has_images is not is_said
+
+
 def test_what_cannot_be_used_is_refused_in_one_line(
     run_folder: Path, tiny_room: Path, tmp_path: Path
 ) -> None:

@@ -92,8 +92,8 @@ class Map:
 
     @property
     def has_images(self) -> bool:
-        """Whether the keyframes' images were saved."""
-        return "images" in self.groups
+        """Whether the image of a keyframe was saved."""
+        return "images" in self.groups and len(self.groups["images"]["keyframe"]) > 0
 
     def trajectory(self, session: int = 0) -> Trajectory:
         """Poses of the frames of a recording.

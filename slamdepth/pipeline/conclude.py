@@ -63,7 +63,7 @@ def conclude(job: Job, tracked: Tracked, tell: ProgressCallback) -> RunResult:
         with_images=job.options.map_images,
     )
     notes = [*dataset.notes, *tracked.notes, *scale_notes, *other_notes]
-    notes += start_map_notes(job.tracker, job.start_map)
+    notes += start_map_notes(job.tracker, job.start_map, with_images=job.options.map_images)
     mesh: Mesh | None = None
     mesh_images: tuple[MeshImage, ...] = ()
     if job.options.mesh:

@@ -57,14 +57,26 @@ def inherited_scale(facts: ScaleFacts, tracker: AnyTracker, number: int, saved: 
     )
 
 
-def start_map_notes(tracker: AnyTracker, saved: Map | None) -> tuple[str, ...]:
-    """Whether the run met the map that it was to go on from."""
-    if saved is None or not isinstance(tracker, Tracker) or tracker.is_in_start_map:
+def start_map_notes(tracker: AnyTracker, saved: Map | None, *, with_images: bool) -> tuple[str, ...]:
+    """Whether the run met the map that it was to go on from, and whether that map's images are lost.
+
+    Args:
+        with_images: the images of the map should be kept.
+    """
+    if saved is None or not isinstance(tracker, Tracker):
         return ()
-    note = (
-        "no frame fits the map that the run was to go on from: the result is a new map with a world frame "
-        "and a scale of its own"
-    )
+    if not tracker.is_in_start_map:
+        note = (
+            "no frame fits the map that the run was to go on from: the result is a new map with a world "
+            "frame and a scale of its own"
+        )
+    elif with_images and saved.has_images and not same_lens(saved.camera, tracker.camera):
+        note = (
+            "the images of the map that the run went on from are not in its own map, since the two have "
+            "different cameras: give both runs one by --camera FILE"
+        )
+    else:
+        return ()
     logger.warning("%s", note)
     return (note,)
 
