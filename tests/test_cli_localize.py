@@ -112,6 +112,7 @@ def test_an_image_of_another_size_is_said_not_to_be_aligned(
 ) -> None:
     own = Map.load(run_folder).camera
     image = cv2.imread(str(images(tiny_room)[12]))
+    assert image is not None
     cv2.imwrite(str(tmp_path / "small.png"), cv2.resize(image, (own.width // 2, own.height // 2)))
     done = call("localize", "--map", run_folder, tmp_path / "small.png", "-o", tmp_path / "one")
     assert done.returncode == 0, done.stderr
