@@ -104,30 +104,28 @@ class LocalMapper:
         """
         features: Features = keyframe.features
         others = [self._map.keyframes[k] for k in self.neighbours(keyframe)]
-        log, sigma = self._surface.log_depth(keyframe, others)
+        aligned, sigma = self._surface.log_depth(keyframe, others)
         unseen = keyframe.landmark_ids < 0
-        known = np.flatnonzero(unseen & np.isfinite(log))
+        known = np.flatnonzero(unseen & np.isfinite(aligned))
         if not len(known):
             return 0.0
         seen, ids, z = self._map.depths_seen(keyframe, observations=2)
         field = fit_depth_field(
             features.raw_px[seen],
-            log[seen],
+            aligned[seen],
             sigma[seen],
             np.log(z),
             self._map.sigma_along_ray(ids, keyframe.center_w),
             width=self._camera.width,
         )
-        correction, posterior = field.correction(features.raw_px[known], log[known], sigma[known])
-        log[known] += correction
+        correction, posterior = field.correction(features.raw_px[known], aligned[known], sigma[known])
+        aligned[known] += correction
         sigma[known] = posterior
-        new = known[
-            (sigma[known] < self._config.depth.max_sigma_log) & self._is_creatable(log[known], posterior)
-        ]
+        new = known[self._is_creatable(aligned[known], posterior)]
         log_depth, sigma_log = keyframe.log_depth.copy(), keyframe.sigma_log.copy()
-        log_depth[new], sigma_log[new] = log[new], sigma[new]
+        log_depth[new], sigma_log[new] = aligned[new], sigma[new]
         self._map.set_prior(keyframe, log_depth, sigma_log)
-        self._map.create_landmarks(keyframe, new, *self._points(keyframe, new, log, sigma))
+        self._map.create_landmarks(keyframe, new, *self._points(keyframe, new, aligned, sigma))
         return len(new) / np.count_nonzero(unseen)
 
     def _points(
