@@ -154,6 +154,20 @@ def test_the_depth_that_frame_and_prediction_share_is_written_once() -> None:
     assert one.size == two.size > 0
 
 
+def test_memory_does_not_decide_what_a_predicted_depth_is() -> None:
+    values = (1.0 + np.random.default_rng(0).random((48, 64))).astype(np.float32)
+    given = Frame(0, 0.0, image(), CAMERA), DepthPrediction(values, DepthKind.METRIC, 0.1 * values)
+    stored = StoredFrame(given[0]), StoredPrediction(given[1])
+    before = stored[1].load()
+    np.testing.assert_allclose(before.values, values, rtol=5e-4)
+    stored[1]._spill(SpillFile(), stored[0])
+    after = stored[1].load()
+    assert before.sigma_log is not None
+    assert after.values.dtype == before.values.dtype == np.float32
+    np.testing.assert_array_equal(after.values, before.values)
+    np.testing.assert_array_equal(after.sigma_log, before.sigma_log)
+
+
 def test_the_newest_stay_resident_whatever_the_budget() -> None:
     store = KeyframeStore(budget_mib=0.0)
     keyframes = [predicted_keyframe(i) for i in range(11)]

@@ -64,6 +64,11 @@ def encode_half_precision(values: NDArray[np.floating]) -> Encoded:
     return Encoded(_encode_png(words), partial(decode_half_precision, dtype=values.dtype))
 
 
+def rounded_to_half_precision(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """What :func:`encode_half_precision` keeps of ``(H, W)``, in the same dtype."""
+    return values.astype(np.float16).astype(values.dtype)
+
+
 def decode_image(data: bytes) -> NDArray[np.uint8]:
     """What :func:`encode_image` was given, ``(H, W, 3)`` RGB, as far as the JPEG keeps it.
 

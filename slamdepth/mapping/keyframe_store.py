@@ -8,6 +8,7 @@ the other. Beyond the budget, the oldest are spilled to a temporary file and rea
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -19,6 +20,7 @@ from slamdepth.mapping.codec import (
     encode_half_precision,
     encode_image,
     encode_sensor_depth,
+    rounded_to_half_precision,
 )
 from slamdepth.mapping.spill_file import SpilledArray, SpillFile
 from slamdepth.types import Camera, DepthKind, DepthPrediction, Frame
@@ -145,6 +147,9 @@ class StoredFrame:
 class StoredPrediction:
     """Handle of a prediction whose maps are in memory or spilled to a file.
 
+    A network's maps are rounded to half precision at once, so that what they decide depends neither on how
+    much memory there is nor on a run that was killed and went on.
+
     Attributes:
         kind, is_sensor, gravity, gravity_share, scale_sigma_log: as for :class:`slamdepth.DepthPrediction`;
             always in memory.
@@ -154,7 +159,7 @@ class StoredPrediction:
         self.kind, self.is_sensor = prediction.kind, prediction.is_sensor
         self.gravity, self.gravity_share = prediction.gravity, prediction.gravity_share
         self.scale_sigma_log = prediction.scale_sigma_log
-        self._resident: DepthPrediction | None = prediction
+        self._resident: DepthPrediction | None = prediction if prediction.is_sensor else _rounded(prediction)
         self._values: SpilledArray | None = None
         self._sigma_log: SpilledArray | None = None
         self._read: Callable[[], DepthPrediction] | None = None
@@ -195,7 +200,7 @@ class StoredPrediction:
     def load(self) -> DepthPrediction:
         """The prediction; where it was spilled, read from the file each time.
 
-        A spilled sensor map is what it was to the bit, a network's is rounded to half precision.
+        A sensor's map is what it was to the bit, a network's is rounded to half precision.
 
         Raises:
             TrackingError: it belongs to a map that was saved without images.
@@ -234,6 +239,16 @@ class StoredPrediction:
         if prediction.sigma_log is not None:
             self._sigma_log = file.spill(encode_half_precision(prediction.sigma_log))
         self._resident = None
+
+
+def _rounded(prediction: DepthPrediction) -> DepthPrediction:
+    """A prediction whose maps have half precision; their types stay."""
+    sigma = prediction.sigma_log
+    return replace(
+        prediction,
+        values=rounded_to_half_precision(prediction.values),
+        sigma_log=None if sigma is None else rounded_to_half_precision(sigma),
+    )
 
 
 class HasImages(Protocol):

@@ -3,7 +3,7 @@
 
 The tracker is saved when nothing is under way in it, so what goes on from there is what would have gone on.
 The state is copied between two frames, and written to disk by another thread. Images of keyframes are read
-again from the sequence; predicted depth is kept in half precision, that of the newest keyframes as it is.
+again from the sequence; predicted depth is kept as keyframes keep it, in half precision.
 """
 
 from __future__ import annotations
@@ -39,10 +39,9 @@ from slamdepth.types import DepthKind, DepthPrediction, Frame, StepResult
 logger = logging.getLogger(__name__)
 
 FOLDER = "checkpoint"
-VERSION = 1
+VERSION = 2
 _RUN, _LATEST, _DEPTH, _STATE = "run.json", "latest.json", "depth.bin", "state-{}.safetensors"
 _SHARE = 0.02  # of the time that may be spent on checkpoints
-_RECENT = 4  # newest keyframes whose depth may be registered with, and is kept as it is
 
 
 @dataclass(frozen=True)
@@ -119,10 +118,9 @@ class Checkpoints:
         start_s = time.monotonic()
         self._finish_writing()
         state = tracker.state()
-        keyframes = tracker.keyframes
         new = [
             (frame.index, stored)
-            for frame, stored in keyframes
+            for frame, stored in tracker.keyframes
             if stored is not None and not stored.is_sensor and frame.index not in self._depths
         ]
         tree = {
@@ -135,7 +133,6 @@ class Checkpoints:
                 now.elapsed_s,
                 now.is_complete,
             ],
-            "recent": _recent(keyframes[-_RECENT:]),
         }
         plain, arrays = flattened(tree)
         data = encode_tensors(arrays, {"tree": plain})
@@ -201,17 +198,6 @@ class Checkpoints:
         self._pool.shutdown(wait=True)
 
 
-def _recent(keyframes: list[tuple[StoredFrame, StoredPrediction | None]]) -> Tree:
-    """The depth of keyframes as it is, by frame."""
-    kept = {}
-    for frame, stored in keyframes:
-        if stored is None or stored.is_sensor or not stored.is_kept:
-            continue
-        prediction = stored.load()
-        kept[str(frame.index)] = {"values": prediction.values, "sigma_log": prediction.sigma_log}
-    return kept
-
-
 @dataclass(frozen=True)
 class Latest:
     """The latest checkpoint of a run, read.
@@ -222,7 +208,6 @@ class Latest:
         number: of the checkpoint.
         depths: place of each keyframe's depth in the file: first byte, bytes of values, bytes of deviations.
         depth_bytes: size of that file.
-        recent: depth of the newest keyframes, by frame.
     """
 
     tracker: Tree
@@ -230,7 +215,6 @@ class Latest:
     number: int
     depths: dict[int, tuple[int, int, int]]
     depth_bytes: int
-    recent: Tree
 
 
 def read_latest(run_folder: Path) -> Latest | None:
@@ -255,9 +239,7 @@ def read_latest(run_folder: Path) -> Latest | None:
         tree = restored(header["tree"], arrays)
         progress = Progress(steps_of(tree["steps"]), *tree["progress"])
         depths = {index: (first, values, sigmas) for index, first, values, sigmas in about["depths"]}
-        return Latest(
-            tree["tracker"], progress, about["number"], depths, about["depth_bytes"], tree["recent"]
-        )
+        return Latest(tree["tracker"], progress, about["number"], depths, about["depth_bytes"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(f"{path}: is damaged: {error}; start the run again with --overwrite") from error
 
@@ -293,9 +275,6 @@ class SequenceKeyframes:
         """The depth that was predicted for a keyframe."""
         from slamdepth.depth.sensor import SensorDepth
 
-        recent = self._latest.recent.get(str(frame.index))
-        if recent is not None:
-            return DepthPrediction(recent["values"], DepthKind.METRIC, recent["sigma_log"])
         place = self._latest.depths.get(frame.index)
         if place is None:
             values = SensorDepth().predict(frame.load()).values
