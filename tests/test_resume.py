@@ -100,6 +100,32 @@ def test_a_tracker_restored_in_a_map_with_images_has_them_still() -> None:
         np.testing.assert_array_equal(other.groups["images"][name], array)
 
 
+def test_a_waiting_keyframe_keeps_its_words_where_they_are_not_its_descriptors() -> None:
+    config = Config.from_dict({"features": {"name": "sift", "count": 400}})
+    given = frames(range(40), colour_only)
+    first = Tracker(CAMERA, ConstantDepth(), config)
+    saved: tuple[int, bytes] | None = None
+    for n, frame in enumerate(given):
+        first.step(frame)
+        if saved is None and n > 10 and first.is_quiet:
+            state = first.state()
+            if state["atlas"]["maps"][0]["integration"]["waiting"]:
+                plain, arrays = flattened(state)
+                saved = n + 1, encode_tensors(arrays, {"tree": plain})
+    assert saved is not None
+    done, data = saved
+    second = Tracker(CAMERA, ConstantDepth(), config)
+    arrays, about = decode_tensors(data)
+    second.restore(
+        restored(about["tree"], arrays), read_frame, lambda frame: ConstantDepth().predict(frame.load())
+    )
+    for frame in given[done:]:
+        second.step(frame)
+    np.testing.assert_array_equal(
+        second.finish().trajectory.T_world_camera, first.finish().trajectory.T_world_camera
+    )
+
+
 def test_results_of_frames_come_back_from_arrays() -> None:
     tracker = Tracker(CAMERA, SensorDepth(), CONFIG)
     steps = [tracker.step(frame) for frame in frames(range(6))]
@@ -148,11 +174,11 @@ def test_a_killed_run_ends_with_the_same_bytes(
     assert not (killed / "report.json").exists()
     done = call("run", "--resume", killed)
     assert done.returncode == 0, done.stderr
+    reports = [json.loads((folder / "report.json").read_text()) for folder in (killed, whole)]
+    assert [report["frames"] for report in reports] == [3 * 78, 3 * 78]  # nobody stopped either of them
     for name in ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map/keyframes.safetensors"):
         assert (killed / name).read_bytes() == (whole / name).read_bytes(), name
     assert not (killed / "checkpoint").exists()
-    reports = [json.loads((folder / "report.json").read_text()) for folder in (killed, whole)]
-    assert reports[0]["frames"] == reports[1]["frames"] == 3 * 78
     assert "going on from the checkpoint" in (killed / "log.txt").read_text()
     again = call("run", "--resume", killed)
     assert (again.returncode, "is finished" in again.stdout) == (0, True)

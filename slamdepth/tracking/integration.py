@@ -38,7 +38,7 @@ from slamdepth.tracking.local_mapper import LocalMapper
 from slamdepth.tracking.localiser import Localiser
 from slamdepth.tracking.prediction_state import prediction_of, prediction_state
 from slamdepth.tracking.rolling_shutter import RollingShutter
-from slamdepth.tracking.workers import GravityInMap, Workers
+from slamdepth.tracking.workers import GravityInMap, Workers, ready
 from slamdepth.types import Camera, Frame
 from slamdepth.typing import Floats
 
@@ -69,6 +69,7 @@ class _Waiting:
         is_known: the depth of earlier keyframes gave it most of the landmarks that it lacked.
         neighbours: keyframes that are still to be searched for its landmarks.
         is_in_stage: a stage has begun and has not ended.
+        words: its place vector ``(W,)``.
     """
 
     keyframe: MapKeyframe
@@ -78,6 +79,7 @@ class _Waiting:
     stage: _Stage = _Stage.LANDMARKS
     neighbours: list[int] = field(default_factory=list)
     is_in_stage: bool = False
+    words: Future[NDArray[np.float32]] | None = None
 
     @property
     def has_depth(self) -> bool:
@@ -149,6 +151,7 @@ class KeyframeIntegration:
 
     def _waiting_state(self, waiting: _Waiting) -> Tree:
         keyframe = waiting.keyframe
+        assert waiting.words is not None
         # what the image says of gravity is added by the time its depth is there
         requested = None if waiting.has_depth else self._workers.depth.requested(keyframe.frame.load())
         return {
@@ -158,6 +161,7 @@ class KeyframeIntegration:
             "prediction": None if requested is None else prediction_state(requested),
             "stage": int(waiting.stage),
             "neighbours": waiting.neighbours,
+            "words": waiting.words.result(),
         }
 
     def restore(self, state: Tree) -> None:
@@ -175,10 +179,9 @@ class KeyframeIntegration:
             waiting = _Waiting(
                 keyframe, one["frames_left"], is_known=one["is_known"], stage=stage, neighbours=neighbours
             )
-            self._wait(waiting)
+            self._wait(waiting, ready(np.array(one["words"])))
         if state["readout"] is not None:
-            self._readout = Future()
-            self._readout.set_result(BundleResult.of_readout(*state["readout"]))
+            self._readout = ready(BundleResult.of_readout(*state["readout"]))
 
     def wants(self, placement: Placement) -> bool:
         """Whether a frame should become a keyframe; see :class:`KeyframePolicy`."""
@@ -242,7 +245,7 @@ class KeyframeIntegration:
         waiting = _Waiting(keyframe, delay)
         if delay > 0 and not (is_waited_for or self._view_change.doubts_depth):
             self._give_surface(waiting)
-        self._wait(waiting)
+        self._wait(waiting, self._workers.side.submit(self.loops.describe, features))
         if is_waited_for:
             self.run_all()
         return keyframe
@@ -258,10 +261,9 @@ class KeyframeIntegration:
         if known >= _MOSTLY_KNOWN:
             waiting.is_known, waiting.stage = True, _Stage.SURFACE
 
-    def _wait(self, waiting: _Waiting) -> None:
+    def _wait(self, waiting: _Waiting, words: Future[NDArray[np.float32]]) -> None:
         """Let a keyframe wait for its stages."""
-        words = self._workers.side.submit(self.loops.describe, waiting.keyframe.features)
-        waiting.stages = self._stages(waiting, words)
+        waiting.words, waiting.stages = words, self._stages(waiting, words)
         self._waiting.append(waiting)
 
     def _stages(self, waiting: _Waiting, words: Future[NDArray[np.float32]]) -> Iterator[None]:

@@ -51,6 +51,13 @@ class Worker:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
+def ready(result: _T) -> Future[_T]:
+    """What a worker would have given, known already: a checkpoint had it."""
+    future: Future[_T] = Future()
+    future.set_result(result)
+    return future
+
+
 class BetweenFrames(Worker):
     """Changes the map after a frame was answered and before the next one looks at the map.
 
@@ -137,9 +144,7 @@ class DepthWorker:
 
     def restore(self, frame: Frame, prediction: DepthPrediction) -> None:
         """As if ``frame`` had been requested, and predicted."""
-        future: Future[DepthPrediction] = Future()
-        future.set_result(prediction)
-        self._requested.append((frame, future))
+        self._requested.append((frame, ready(prediction)))
 
     def _predict(self, frame: Frame, gravity: GravityInMap | None) -> DepthPrediction:
         if gravity is None or frame.gravity is not None:
