@@ -168,6 +168,29 @@ def test_memory_does_not_decide_what_a_predicted_depth_is() -> None:
     np.testing.assert_array_equal(after.sigma_log, before.sigma_log)
 
 
+def test_images_read_again_after_a_kill_are_those_that_memory_would_have_kept() -> None:
+    def made(seed: int) -> Stored:
+        return Stored(StoredFrame(Frame(seed, seed / 30.0, image(seed), CAMERA)), None)
+
+    def read_again(seed: int) -> Stored:
+        reader = made(seed).frame.load
+        return Stored(StoredFrame.of_saved(seed, seed / 30.0, CAMERA, read=reader), None)
+
+    budget_mib = 10 * image().nbytes / 2**20
+    store, other = KeyframeStore(budget_mib), KeyframeStore(budget_mib)
+    unbroken, resumed = [made(i) for i in range(12)], [read_again(i) for i in range(12)]
+    store.tidy(unbroken)
+    other.restore(store.state(), resumed)
+    for keyframes, keeps in ((unbroken, store), (resumed, other)):
+        keyframes += [made(i) for i in range(12, 16)]
+        keeps.tidy(keyframes)
+    assert store.state() == other.state()
+    assert [k.frame.is_spilled for k in unbroken] == 6 * [True] + 10 * [False]
+    for one, two in zip(unbroken, resumed, strict=True):
+        np.testing.assert_array_equal(one.frame.load().image_rgb, two.frame.load().image_rgb)
+        assert one.frame.image_bytes() == two.frame.image_bytes()
+
+
 def test_the_newest_stay_resident_whatever_the_budget() -> None:
     store = KeyframeStore(budget_mib=0.0)
     keyframes = [predicted_keyframe(i) for i in range(11)]

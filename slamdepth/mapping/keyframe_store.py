@@ -46,6 +46,7 @@ class StoredFrame:
         self._depth: SpilledArray | None = None
         self._jpeg: Encoded | None = None  # of a saved map, or of a resident image once it was asked for
         self._read: Callable[[], Frame] | None = None
+        self._is_read_as_jpeg = False
 
     @classmethod
     def of_saved(
@@ -66,7 +67,7 @@ class StoredFrame:
         stored = cls.__new__(cls)
         stored.index, stored.timestamp_s, stored.camera, stored.gravity = index, timestamp_s, camera, gravity
         stored._resident = stored._image = stored._depth = None
-        stored._read = read
+        stored._read, stored._is_read_as_jpeg = read, False
         stored._jpeg = None if jpeg is None else Encoded(jpeg, stored._decoded)
         return stored
 
@@ -92,7 +93,10 @@ class StoredFrame:
         if (frame := self._resident) is not None:
             return frame
         if self._read is not None:
-            return self._read()
+            frame = self._read()
+            if not self._is_read_as_jpeg:
+                return frame
+            return replace(frame, image_rgb=np.asarray(encode_image(frame.image_rgb).array()))
         if self._jpeg is not None:
             image_rgb = self._jpeg.array()
             return Frame(self.index, self.timestamp_s, image_rgb, self.camera, gravity=self.gravity)
@@ -119,7 +123,8 @@ class StoredFrame:
             return self._jpeg
         if self._resident is None and self._image is not None:
             return self._image.encoded()
-        jpeg = encode_image(self.load().image_rgb)
+        frame = self.load() if self._read is None else self._read()
+        jpeg = encode_image(frame.image_rgb)
         if self._resident is not None:
             self._jpeg = jpeg
         return jpeg
@@ -135,8 +140,9 @@ class StoredFrame:
         return image_rgb
 
     def _spill(self, file: SpillFile) -> None:
-        """Move the images to ``file``."""
+        """Move the images to ``file``; those that the sequence has stay there, and lose as much."""
         if (frame := self._resident) is None:
+            self._is_read_as_jpeg = self._read is not None
             return
         if frame.depth_m is not None:
             self._depth = file.spill(encode_sensor_depth(frame.depth_m, frame.camera.depth_factor))
@@ -284,6 +290,20 @@ class KeyframeStore:
     def spilled_bytes(self) -> int:
         """Size of the temporary file."""
         return self._file.size
+
+    def state(self) -> list[Any]:
+        """Everything it remembers, for a checkpoint."""
+        return [list(self._sizes), self._spilled]
+
+    def restore(self, state: Sequence[Any], keyframes: Sequence[HasImages]) -> None:
+        """Remember what :meth:`state` gave, so that the same images are kept as JPEGs as would have been.
+
+        Args:
+            keyframes: read from their sequence.
+        """
+        self._sizes, self._spilled = list(state[0]), state[1]
+        for keyframe in keyframes[: self._spilled]:
+            keyframe.frame._spill(self._file)
 
     def tidy(self, keyframes: Sequence[HasImages], budget_bytes: float | None = None) -> None:
         """Spill the oldest of ``keyframes`` until the rest is within the budget.

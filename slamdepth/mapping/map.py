@@ -370,6 +370,7 @@ class Map(MapView):
         landmarks: Landmarks,
         starts: Iterable[int],
         compact_at: int | None = None,
+        stored: Sequence[Any] | None = None,
     ) -> None:
         """Fill an empty map with what was saved of one.
 
@@ -377,6 +378,7 @@ class Map(MapView):
             states: with ids from 0.
             landmarks: copied.
             compact_at: number of landmarks that the next :meth:`compact` waits for; None as after one.
+            stored: which images were in memory, see :attr:`stored`; None: those of all ``states``.
         """
         size = len(landmarks)
         self._states = list(states)
@@ -386,6 +388,8 @@ class Map(MapView):
         self.keyframes = tuple(MapKeyframe(state) for state in self._states)
         self.starts = frozenset(starts)
         self._compact_at = max(_COMPACT_FROM, 2 * size) if compact_at is None else compact_at
+        if stored is not None:
+            self._store.restore(stored, self._states)
 
     def begin_sessions(self) -> None:
         """All keyframes come from one recording, which is the first one of the map."""
@@ -403,6 +407,11 @@ class Map(MapView):
     def compact_at(self) -> int:
         """Number of landmarks that the next :meth:`compact` waits for."""
         return self._compact_at
+
+    @property
+    def stored(self) -> Sequence[Any]:
+        """Which images and depth maps are in memory, for a checkpoint."""
+        return self._store.state()
 
     def compact(self, *, at_once: bool = False) -> Ints | None:
         """Give away the ids of landmarks that are gone, once there are twice as many as after the last time.

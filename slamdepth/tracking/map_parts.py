@@ -135,7 +135,12 @@ class MapParts:
             "metric": metric_state(map_.keyframes[0].features.metric),
             "keyframes": keyframe_arrays(map_.keyframes),
             "landmarks": landmark_arrays(map_.landmarks),
-            "map": {"starts": sorted(map_.starts), "session": map_.session, "compact_at": map_.compact_at},
+            "map": {
+                "starts": sorted(map_.starts),
+                "session": map_.session,
+                "compact_at": map_.compact_at,
+                "stored": map_.stored,
+            },
             "past": self.past.arrays(),
             "frames": self.frames.state(),
             "motion": self.motion.state(),
@@ -171,7 +176,13 @@ class MapParts:
 
         states = keyframe_states(state["keyframes"], metric_of(state["metric"]), frame_of, read)
         about = state["map"]
-        self.map.restore(states, landmarks_of(state["landmarks"]), about["starts"], about["compact_at"])
+        self.map.restore(
+            states,
+            landmarks_of(state["landmarks"]),
+            about["starts"],
+            about["compact_at"],
+            about["stored"],
+        )
         self.map.session = session
         keyframes = self.map.keyframes
         self.id, self.is_loaded = state["id"], state["is_loaded"]
