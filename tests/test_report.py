@@ -71,7 +71,7 @@ def test_summary_has_the_promised_keys_and_values() -> None:
         assert summary["rpe"][span]["trans_rmse_m"] > 0
         assert summary["rpe"][span]["rot_rmse_deg"] > 0
     assert summary["depth"]["metric"]["abs_rel"] == pytest.approx(0.1, rel=1e-4)
-    assert summary["depth"]["sequence_median"]["abs_rel"] == pytest.approx(0.0, abs=1e-5)
+    assert summary["depth"]["sequence_median"]["abs_rel"] == pytest.approx(0.0, abs=5e-4)  # half precision
     scale = summary["scale"]
     assert (scale["source"], scale["factor"], scale["uncertainty_log"]) == ("camera-height", 1.2, 0.03)
     assert (scale["keyframes"], scale["spread"], scale["sentence"]) == (6, 0.1, SCALE.sentence)
