@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, align
+from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, align, align_near, central_views
 from slamdepth.typing import Bytes, Floats
 
 POINTS = np.array([[60.0, 50.0], [100.0, 70.0], [80.0, 90.0], [130.0, 60.0]])
@@ -102,3 +102,18 @@ def test_the_same_patches_one_by_one_or_together() -> None:
     np.testing.assert_allclose(
         align(other, joined, SAME, POINTS)[0], align(other, together, SAME, POINTS)[0], atol=1e-3
     )
+
+
+def test_a_patch_is_believed_near_where_it_was_expected_and_at_about_its_size() -> None:
+    templates, start = Templates.of(ImagePyramid(image()), POINTS, ONES), POINTS + 1.0
+    there = ImagePyramid(image())
+    px, good = align_near(there, templates, SAME, start, np.array([2.0, 2.0, 1.0, 1.0]))
+    np.testing.assert_allclose(px, POINTS, atol=0.02)
+    assert good.tolist() == [True, True, False, False]  # 1.4 px away
+    assert not align_near(there, templates, 2.1 * SAME, POINTS, 2.0)[1].any()
+
+
+def test_the_view_in_the_middle_of_all_is_taken_for_each_point() -> None:
+    towards = np.array([[1.0, 0, 1], [0, 2, 2], [0, 0, 5], [-1, 0, 1]])
+    point = np.array([0, 2, 0, 0])
+    assert central_views(towards, point, 4).tolist() == [2, -1, 1, -1]

@@ -15,15 +15,19 @@ import numpy as np
 from slamdepth.export.images import ExportImages
 from slamdepth.export.scene import ExportScene
 from slamdepth.export.tracks import MAX_ERROR_PX, Tracks, numbered
-from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, align, facing_warp
+from slamdepth.frontend.patch_alignment import (
+    ImagePyramid,
+    Templates,
+    align_near,
+    central_views,
+    facing_warp,
+)
 from slamdepth.geometry import invert
 from slamdepth.mapping.codec import Encoded, encode_image
 from slamdepth.typing import Bools, Bytes, Floats, Ints
 
 _WORKING_PX = 1280  # longest side of the images that are compared
 _SPACING_PX = 1.5  # of a patch's samples
-_LEAST_CORRELATION = 0.85
-_MOST_ZOOM = 2.0  # of one view against another: a patch at another size shows other things
 _TRIANGULATIONS = 8
 _DAMPING = 1e-3  # of a Gauss-Newton step
 _HUBER_PX = 1.0
@@ -111,7 +115,8 @@ def _aligned(
     small: SmallImages,
 ) -> tuple[Floats, Bools]:
     """Pixels ``(M, 2)`` of observations: where the patch of each point's reference is; which were found."""
-    reference = _references(T_camera_world, points_m, view, point)
+    center_w = invert(T_camera_world)[:, :3, 3]
+    reference = central_views(center_w[view] - points_m[point], point, len(points_m))[point]
     own = np.flatnonzero(reference == np.arange(len(point)))
     own = own[np.argsort(view[own], kind="stable")]
     working_px = (px + 0.5) * small.share - 0.5
@@ -127,32 +132,18 @@ def _aligned(
     usable = patches.is_usable[patch[point]]
     found = usable & (reference == np.arange(len(point)))
     focal_px = small.share * np.array([images.camera.fx, images.camera.fy])
+    farthest_px = MAX_ERROR_PX * small.share * images.magnification
     others = np.flatnonzero(usable & ~found)
     for number in np.unique(view[others]):
         at = others[view[others] == number]
         warp = facing_warp(
             T_camera_world[number], T_camera_world, view[reference[at]], points_m[point[at]], focal_px
         )
-        there, correlation = align(small.load(number), patches.taken(patch[point[at]]), warp, working_px[at])
-        zoom = np.sqrt(np.abs(np.linalg.det(warp)))
-        way_px = np.linalg.norm(there - working_px[at], axis=1)
-        good = (correlation > _LEAST_CORRELATION) & (zoom < _MOST_ZOOM) & (zoom > 1.0 / _MOST_ZOOM)
-        good &= way_px < MAX_ERROR_PX * small.share * images.magnification
+        there, good = align_near(
+            small.load(number), patches.taken(patch[point[at]]), warp, working_px[at], farthest_px
+        )
         working_px[at[good]], found[at] = there[good], good
     return (working_px + 0.5) / small.share - 0.5, found
-
-
-def _references(T_camera_world: Floats, points_m: Floats, view: Ints, point: Ints) -> Ints:
-    """Of each observation ``(M,)``, that of its point by the view nearest to the mean direction of all."""
-    towards = invert(T_camera_world)[view, :3, 3] - points_m[point]
-    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    mean = np.zeros_like(points_m)
-    np.add.at(mean, point, towards)
-    order = np.lexsort((-np.einsum("ni,ni->n", towards, mean[point]), point))
-    names, first = np.unique(point[order], return_index=True)
-    reference = np.full(len(points_m), -1)
-    reference[names] = order[first]
-    return np.asarray(reference[point], np.int64)
 
 
 def _triangulated(points_m: Floats, T_camera_world: Floats, point: Ints, px: Floats, K: Floats) -> Floats:

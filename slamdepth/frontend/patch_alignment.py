@@ -24,6 +24,8 @@ _CONVERGED_PX = 0.003
 _LONGEST_STEP = 1.5  # samples
 _LEAST_CONTRAST = 2.0  # grey values
 _LEAST_CURVATURE = 1e-3  # along the direction the patch tells least of, 1 per sample^2; 0 along an edge
+_LEAST_CORRELATION = 0.85
+_MOST_ZOOM = 2.0  # of one view against another: a patch at another size shows other things
 _CHUNK = 30_000  # rows that cv2.remap takes at a time
 
 _v, _u = np.mgrid[-_HALF : _HALF + 1, -_HALF : _HALF + 1]
@@ -154,6 +156,49 @@ def align(image: ImagePyramid, templates: Templates, warp: Floats, px: Floats) -
             break
     found, _ = _normalised(image.sample(px[:, None] + offsets, spacing))
     return px, np.asarray((found * templates.values * _WEIGHTS).sum(axis=1), np.float64)
+
+
+def align_near(
+    image: ImagePyramid, templates: Templates, warp: Floats, px: Floats, farthest_px: Floats | float
+) -> tuple[Floats, Bools]:
+    """:func:`align`, and which results can be believed.
+
+    Args:
+        farthest_px: from ``px``, for each ``(N,)`` or all.
+
+    Returns:
+        Pixels ``(N, 2)``, and ``(N,)`` where the patches agree near ``px``.
+    """
+    found_px, correlation = align(image, templates, warp, px)
+    zoom = np.sqrt(np.abs(np.linalg.det(warp)))
+    good = (correlation > _LEAST_CORRELATION) & (zoom < _MOST_ZOOM) & (zoom > 1.0 / _MOST_ZOOM)
+    good &= np.linalg.norm(found_px - px, axis=1) < farthest_px
+    return found_px, np.asarray(good, np.bool_)
+
+
+def central_views(towards: Floats, point: Ints, size: int) -> Ints:
+    """Of ``size`` points, which view ``(size,)`` is nearest to the middle of all that see it.
+
+    Args:
+        towards: ``(M, 3)`` from the point to the camera, for each view of each point.
+        point: ``(M,)``.
+
+    Returns:
+        Rows of ``towards``, -1 for a point without views.
+    """
+    towards = _unit(towards)
+    mean = np.zeros((size, 3))
+    np.add.at(mean, point, towards)
+    nearness = np.einsum("mi,mi->m", towards, _unit(mean)[point])
+    order = np.lexsort((-nearness, point))
+    points, first = np.unique(point[order], return_index=True)
+    rows = np.full(size, -1)
+    rows[points] = order[first]
+    return rows
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
 
 def facing_warp(

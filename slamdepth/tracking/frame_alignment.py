@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamdepth.frontend.features import Features, ScaleLevels
-from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, facing_warp
+from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, align_near, facing_warp
 from slamdepth.mapping.map import Map
 from slamdepth.mapping.placement import Placement
-from slamdepth.tracking.keypoint_alignment import ALIGNED_SHARE, References, aligned
+from slamdepth.tracking.keypoint_alignment import ALIGNED_SHARE, FARTHEST, References
 from slamdepth.types import Frame
 from slamdepth.typing import Ints
 
@@ -66,7 +66,8 @@ class FrameAligner:
                 self._map.landmarks.position_w[view.ids[place]],
                 np.array([frame.camera.fx, frame.camera.fy]),
             )
-            px, good = aligned(image, view.templates.taken(place), warp, raw.raw_px[own], raw.sigma_px[own])
+            farthest_px = FARTHEST * raw.sigma_px[own]
+            px, good = align_near(image, view.templates.taken(place), warp, raw.raw_px[own], farthest_px)
             raw_px[own[good]] = px[good]
             sigma_px[own[good]] *= ALIGNED_SHARE
         self._forget()

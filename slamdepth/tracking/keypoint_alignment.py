@@ -15,7 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamdepth.frontend.features import Features, ScaleLevels
-from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, align, facing_warp
+from slamdepth.frontend.patch_alignment import (
+    ImagePyramid,
+    Templates,
+    align_near,
+    central_views,
+    facing_warp,
+)
 from slamdepth.mapping.map import Map, MapKeyframe
 from slamdepth.tracking.rolling_shutter import RollingShutter
 from slamdepth.tracking.workers import in_parallel
@@ -25,9 +31,8 @@ log = logging.getLogger(__name__)
 
 ALIGNED_SHARE = 0.25
 """An aligned keypoint's deviation over a detected one's."""
-_LEAST_CORRELATION = 0.85
-_FARTHEST = 2.5  # deviations of a detected keypoint
-_MOST_ZOOM = 2.0  # of one view against another: a patch at another size shows other things
+FARTHEST = 2.5
+"""Deviations of a detected keypoint, within which it is aligned."""
 _TEMPLATES = 30_000  # in memory at a time, 1 kB each
 
 
@@ -78,24 +83,14 @@ class References:
         Args:
             views: keyframes that see it, at least.
         """
-        size, keyframes, often = map_.size, map_.keyframes, map_.seen_by(views)
+        keyframes, often = map_.keyframes, map_.seen_by(views)
         seen = [_seen(keyframe) for keyframe in keyframes]
-        directions = [
-            _unit(keyframe.center_w - map_.landmarks.position_w[ids])
-            for keyframe, (_, ids) in zip(keyframes, seen, strict=True)
-        ]
-        mean = np.zeros((size, 3))
-        for (_, ids), direction in zip(seen, directions, strict=True):
-            mean[ids] += direction  # a keyframe sees a landmark once
-        mean = _unit(mean)
-        best, chosen, chosen_feature = np.full(size, -np.inf), np.full(size, -1), np.full(size, -1)
-        is_often = np.zeros(size, dtype=np.bool_)
-        is_often[often] = True
-        for number, ((at, ids), direction) in enumerate(zip(seen, directions, strict=True)):
-            nearness = np.einsum("ni,ni->n", direction, mean[ids])
-            better = (nearness > best[ids]) & is_often[ids]
-            ids = ids[better]
-            best[ids], chosen[ids], chosen_feature[ids] = nearness[better], number, at[better]
+        feature, ids = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+        number = np.repeat(np.arange(len(keyframes)), [len(at) for at, _ in seen])
+        center_w = np.array([keyframe.center_w for keyframe in keyframes])
+        central = central_views(center_w[number] - map_.landmarks.position_w[ids], ids, map_.size)[often]
+        chosen, chosen_feature = np.full(map_.size, -1), np.full(map_.size, -1)
+        chosen[often], chosen_feature[often] = number[central], feature[central]
         return cls(chosen, chosen_feature, int(map_.landmarks.observations[often].sum()))
 
     def batches(self) -> Iterator[Ints]:
@@ -187,36 +182,13 @@ class _Batch:
             self.map_.landmarks.position_w[ids],
             np.array([camera.fx, camera.fy]),
         )
-        templates, sigma_px = self.templates.taken(self.place[ids]), keypoints.features.sigma_px[at]
-        px, good = aligned(image, templates, warp, keypoints.raw_px[at], sigma_px)
+        farthest_px = FARTHEST * keypoints.features.sigma_px[at]
+        templates = self.templates.taken(self.place[ids])
+        px, good = align_near(image, templates, warp, keypoints.raw_px[at], farthest_px)
         return keypoints.moved(at[good], px[good])
-
-
-def aligned(
-    image: ImagePyramid, templates: Templates, warp: Floats, raw_px: Floats, sigma_px: Floats
-) -> tuple[Floats, Bools]:
-    """Keypoints aligned to the patches of other views, and which of them can be believed.
-
-    Args:
-        warp: ``(N, 2, 2)`` from offsets in those views to offsets in this image.
-        raw_px: ``(N, 2)`` where they were detected, with deviations ``sigma_px (N,)``.
-
-    Returns:
-        Pixels ``(N, 2)``, and ``(N,)`` where the patches agree near the detected keypoint.
-    """
-    px, correlation = align(image, templates, warp, raw_px)
-    zoom = np.sqrt(np.abs(np.linalg.det(warp)))
-    way = np.linalg.norm(px - raw_px, axis=1) / sigma_px
-    good = (correlation > _LEAST_CORRELATION) & (way < _FARTHEST)
-    good &= (zoom < _MOST_ZOOM) & (zoom > 1.0 / _MOST_ZOOM)
-    return px, np.asarray(good, np.bool_)
 
 
 def _seen(keyframe: MapKeyframe) -> tuple[Ints, Ints]:
     """Features with a landmark, and their landmarks."""
     at = np.flatnonzero(keyframe.landmark_ids >= 0)
     return at, keyframe.landmark_ids[at]
-
-
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
