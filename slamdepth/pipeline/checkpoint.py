@@ -39,7 +39,7 @@ from slamdepth.types import DepthKind, DepthPrediction, Frame, StepResult
 logger = logging.getLogger(__name__)
 
 FOLDER = "checkpoint"
-VERSION = 2
+VERSION = 3
 _RUN, _LATEST, _DEPTH, _STATE = "run.json", "latest.json", "depth.bin", "state-{}.safetensors"
 _SHARE = 0.02  # of the time that may be spent on checkpoints
 

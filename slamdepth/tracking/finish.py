@@ -109,17 +109,20 @@ def _finish_map(tracked: MapTracker, config: Config, watch: Stopwatch, steps: in
         keyframes = tuple(replace(made.result(), id=n) for n, made in enumerate(making))
     points_m = map_.landmarks.position_w[seen]
     found = frames.trajectory()
-    trajectory = confirmed(found, points_m, frames.quality, frames.follows_motion)
+    trajectory = frames.with_repeats(confirmed(found, points_m, frames.quality, frames.follows_motion))
     kept_s = set(trajectory.timestamps_s.tolist())
-    withdrawn = frames.withdrawn + len(found) - len(trajectory)
+    withdrawn = frames.withdrawn + len(found) + frames.repeated - len(trajectory)
     statistics = replace(statistics, tracked=len(trajectory), withdrawn=withdrawn)
     kept = tuple(one for one in keyframes if one.frame.timestamp_s in kept_s)
+    notes = final.notes
+    if repeated := frames.repeated:
+        notes += (f"{repeated} images repeat the one before, and have its pose",)
     return Reconstruction(
         trajectory=trajectory,
         keyframes=kept,
         points_m=points_m,
         gravity_w=integration.gravity.in_world(),
-        notes=final.notes,
+        notes=notes,
         statistics=statistics,
         loops=_loops(integration, in_time, kept),
     )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,7 @@ class FrameLog:
         self._camera = camera.without_distortion()
         self._map = map_
         self._placed: list[_Placed] = []
+        self._repeats: dict[float, list[float]] = {}  # times of images that repeat a placed one, by its time
         self.withdrawn = 0
         self._settled = 0  # so many of the first frames are settled, or more
         # ids are remembered as they were then, offset by all ids that compactions have renumbered
@@ -134,6 +135,25 @@ class FrameLog:
             )
         )
 
+    @property
+    def last_time_s(self) -> float | None:
+        """Time of the frame that was placed last."""
+        return self._placed[-1].timestamp_s if self._placed else None
+
+    @property
+    def last_T_world_camera(self) -> Floats:
+        """Pose ``(4, 4)`` of the frame that was placed last, in the map as it is now."""
+        return invert(self._placed[-1].pose.T_camera_world)
+
+    def repeat(self, timestamp_s: float) -> None:
+        """Remember an image that repeats that of the frame placed last: it has that one's pose."""
+        self._repeats.setdefault(self._placed[-1].timestamp_s, []).append(timestamp_s)
+
+    @property
+    def repeated(self) -> int:
+        """Number of images that repeat that of a frame with a pose."""
+        return sum(map(len, self._repeats.values()))
+
     def state(self) -> Tree:
         """Everything it remembers, for a checkpoint."""
         placed = self._placed
@@ -150,6 +170,7 @@ class FrameLog:
             "phase": np.concatenate([none, *(p.phase for p in placed)]),
             "sigma_px": np.concatenate([none, *(p.sigma_px for p in placed)]),
             "ids_now": self._ids_now,
+            "repeats": np.array(self._repeat_pairs(), dtype=np.float64).reshape(-1, 2),
             "counts": [self.withdrawn, self._settled, self._prune_at],
         }
 
@@ -175,12 +196,23 @@ class FrameLog:
                 )
             )
         self._ids_now = np.array(state["ids_now"])
+        self._repeats = {}
+        for of_s, timestamp_s in state["repeats"].tolist():
+            self._repeats.setdefault(of_s, []).append(timestamp_s)
         self.withdrawn, self._settled, self._prune_at = state["counts"]
 
     @property
     def poses(self) -> list[tuple[float, AnchoredPose]]:
-        """Time and pose of each placed frame, in order."""
-        return [(placed.timestamp_s, placed.pose) for placed in self._placed]
+        """Time and pose of each frame, in order; those whose image repeats a placed one among them."""
+        return [
+            (timestamp_s, placed.pose)
+            for placed in self._placed
+            for timestamp_s in (placed.timestamp_s, *self._repeats.get(placed.timestamp_s, ()))
+        ]
+
+    def _repeat_pairs(self) -> list[tuple[float, float]]:
+        """Time of a placed frame and of an image that repeats it, for each such image."""
+        return [(of_s, timestamp_s) for of_s, times_s in self._repeats.items() for timestamp_s in times_s]
 
     def withdraw(self, times_s: Sequence[float]) -> None:
         """Forget the poses of frames of these times; keyframes keep theirs."""
@@ -189,6 +221,9 @@ class FrameLog:
             kept = [p for p in self._placed if p.is_keyframe or p.timestamp_s not in times_s]
             self._settled = 0
             self._placed, self.withdrawn = kept, self.withdrawn + before - len(kept)
+            kept_s = {p.timestamp_s for p in kept}
+            for of_s in [of_s for of_s in self._repeats if of_s not in kept_s]:
+                self.withdrawn += len(self._repeats.pop(of_s))
 
     def renumber(self, ids_now: Ints) -> None:
         """Follow new landmark ids ``(size + 1,)``, see :meth:`Map.compact`."""
@@ -208,6 +243,7 @@ class FrameLog:
         for placed in other._placed:
             placed.landmark_ids = placed.landmark_ids + np.int32(first_landmark + len(self._ids_now))
         self.withdrawn += other.withdrawn
+        self._repeats.update(other._repeats)
         self._placed = sorted(self._placed + other._placed, key=lambda placed: placed.timestamp_s)
         self._settled = 0
 
@@ -376,7 +412,20 @@ class FrameLog:
         return np.array([p.follows_motion for p in self._placed], dtype=np.bool_)
 
     def trajectory(self) -> Trajectory:
-        """All placed frames in the world frame."""
+        """All placed frames in the world frame, without those whose image repeats another."""
         times = np.array([p.timestamp_s for p in self._placed])
         T_camera_world = np.array([p.pose.T_camera_world for p in self._placed]).reshape(-1, 4, 4)
         return Trajectory(times, invert(T_camera_world))
+
+    def with_repeats(self, trajectory: Trajectory) -> Trajectory:
+        """``trajectory`` with the frames whose image repeats one of its frames."""
+        row = {timestamp_s: n for n, timestamp_s in enumerate(trajectory.timestamps_s.tolist())}
+        pairs = [(of_s, timestamp_s) for of_s, timestamp_s in self._repeat_pairs() if of_s in row]
+        if not pairs:
+            return trajectory
+        times = np.concatenate([trajectory.timestamps_s, [timestamp_s for _, timestamp_s in pairs]])
+        rows = np.concatenate([np.arange(len(trajectory)), [row[of_s] for of_s, _ in pairs]]).astype(np.int64)
+        order = np.argsort(times)
+        return replace(
+            trajectory, timestamps_s=times[order], T_world_camera=trajectory.T_world_camera[rows[order]]
+        )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import TracebackType
 from typing import Any
 
@@ -18,6 +18,7 @@ from slamdepth.errors import DatasetError, TrackingError
 from slamdepth.frontend.compiled import load
 from slamdepth.frontend.features import Features
 from slamdepth.frontend.preparation import Preparation, Prepared
+from slamdepth.frontend.repeated_images import has_same_depth, is_repeated
 from slamdepth.geometry import invert
 from slamdepth.io.tree import Tree
 from slamdepth.mapping.keyframe_store import StoredFrame, StoredPrediction
@@ -85,6 +86,7 @@ class Tracker:
             self._go_on_from(start_map, is_measured=is_sensor(model))
         self._steps = 0
         self._last_time_s = -np.inf
+        self._last_seen: tuple[Frame, StepResult] | None = None  # that was tracked last, if it was placed
         self._finished = False
         self._is_complete = False
         self._is_watched = False
@@ -181,11 +183,10 @@ class Tracker:
         with single_threaded():
             raw = self._features(frame, prepared)
             self._workers.between.wait()
-            placed = self._atlas.track(frame, raw)
-            result = self._result(frame, placed)
+            result = self._repeated(frame) or self._track(frame, raw)
             if self._is_watched and self._active.map.keyframes:
                 self._snapshot, self._is_watched = snapshot_of(self._active), False
-        self._last_time_s = self._active.motion.last_time_s = frame.timestamp_s
+        self._last_time_s = frame.timestamp_s
         self._watch.next_frame()
         if self._active.map.keyframes:
             self._active.integration.count_frame()
@@ -207,6 +208,33 @@ class Tracker:
         self._watch.add("features", prepared.took_ms)
         self._steps += 1
         return prepared.features
+
+    def _track(self, frame: Frame, raw: Features) -> StepResult:
+        placed = self._atlas.track(frame, raw)
+        result = self._result(frame, placed)
+        self._active.motion.last_time_s = frame.timestamp_s
+        self._last_seen = None if placed is None else (frame, result)
+        return result
+
+    def _repeated(self, frame: Frame) -> StepResult | None:
+        """The result for an image that repeats the one placed last and tells nothing new; None for others."""
+        if self._last_seen is None:
+            return None
+        last, result = self._last_seen
+        frames = self._active.frames
+        is_last = frames.last_time_s == last.timestamp_s and has_same_depth(frame, last)
+        if not (is_last and is_repeated(frame.image_rgb, last.image_rgb)):
+            return None
+        frames.repeat(frame.timestamp_s)
+        return replace(
+            self._result(frame, None),
+            status=result.status,
+            T_world_camera=frames.last_T_world_camera,
+            inliers=result.inliers,
+            covariance=result.covariance,
+            quality=result.quality,
+            moving_share=result.moving_share,
+        )
 
     def _result(self, frame: Frame, placed: Placed | None) -> StepResult:
         maps = self._atlas.maps
@@ -246,6 +274,7 @@ class Tracker:
             "last_time_s": self._last_time_s,
             "is_complete": self._is_complete,
             "earlier": [asdict(session) for session in self._earlier],
+            "last_seen": None if self._last_seen is None else _seen_state(*self._last_seen),
             "watch": self._watch.state(),
         }
 
@@ -266,6 +295,9 @@ class Tracker:
         self._atlas.restore(state["atlas"], stored)
         self._steps, self._last_time_s = state["steps"], state["last_time_s"]
         self._is_complete = state["is_complete"]
+        if state["last_seen"] is not None:
+            last = read_frame(state["last_seen"]["index"])
+            self._last_seen = last, _seen_result(last, state["last_seen"])
         self._watch.restore(state["watch"])
 
     @property
@@ -342,6 +374,30 @@ def sights_seen(tracker: object) -> Sights | None:
                 if tracker.config.bundle.align and not one.is_loaded:
                     align_keypoints(one.map, one.shutter, one.localiser.levels)
     return sights_of(tracker._atlas.maps, tracker.camera)
+
+
+def _seen_state(frame: Frame, result: StepResult) -> Tree:
+    return {
+        "index": frame.index,
+        "status": result.status.value,
+        "inliers": result.inliers,
+        "covariance": result.covariance,
+        "quality": result.quality,
+        "moving_share": result.moving_share,
+    }
+
+
+def _seen_result(frame: Frame, state: Tree) -> StepResult:
+    return StepResult(
+        frame.index,
+        frame.timestamp_s,
+        TrackingStatus(state["status"]),
+        None,
+        state["inliers"],
+        covariance=state["covariance"],
+        quality=state["quality"],
+        moving_share=state["moving_share"],
+    )
 
 
 def _load_libraries() -> None:
