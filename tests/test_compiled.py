@@ -21,6 +21,7 @@ from slamdepth.frontend.matching import PixelGrid, match_all
 from slamdepth.frontend.metric import ORB, DescriptorMetric, Hamming, UnitL2, hamming_nearest
 from slamdepth.frontend.moving import moving_share
 from slamdepth.frontend.orb_pattern import orb_pattern
+from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, _align, align
 from slamdepth.frontend.pose import pose_covariance, refine_pose
 from slamdepth.geometry import project, se3_exp, transform
 from slamdepth.mapping.landmarks import Landmarks
@@ -260,6 +261,35 @@ def test_another_orb_is_used_as_it_is(
         extractor = OrbExtractor(FeatureConfig())
     assert not extractor.is_compiled
     assert "differs from the compiled one" in caplog.text
+
+
+@pytest.mark.parametrize("size", [(480, 640), (40, 30), (12, 9)])
+def test_patches_are_aligned_as_without_compiled_loops(size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(4)
+    grey = noise(size, blur=2.0)
+    shifted = cv2.warpAffine(grey, np.array([[1.0, 0.02, 0.4], [-0.02, 1.0, -0.3]]), size[::-1])
+    pyramids = [ImagePyramid(np.dstack([one] * 3).astype(np.uint8)) for one in (grey, shifted)]
+    px = rng.uniform(-2, np.array(size[::-1]) + 2, (300, 2))
+    templates = Templates.of(pyramids[0], px, rng.uniform(0.7, 6.0, 300))
+    warp = np.eye(2) + rng.normal(0.0, 0.05, (300, 2, 2))
+    fast, slow = align(pyramids[1], templates, warp, px), _align(pyramids[1], templates, warp, px)
+    fits = templates.is_usable & (slow[1] > 0.85)
+    assert fits.sum() > 10
+    np.testing.assert_allclose(fast[0][fits], slow[0][fits], atol=0.05)  # remap's places may be coarse
+    np.testing.assert_allclose(fast[1][fits], slow[1][fits], atol=0.02)
+    assert (fast[1][templates.is_usable & (slow[1] < 0.8)] < 0.85).all()
+
+
+def test_a_patch_that_nothing_is_known_of_fits_nowhere() -> None:
+    pyramid = ImagePyramid(np.dstack([noise((60, 80))] * 3).astype(np.uint8))
+    px = np.array([[40.0, 30.0], [np.nan, 30.0], [np.inf, 30.0], [40.0, 30.0], [1e300, -1e300]])
+    warp = np.broadcast_to(np.eye(2), (5, 2, 2)).copy()
+    warp[3] = np.nan
+    templates = Templates.of(pyramid, np.broadcast_to(px[:1], (5, 2)), np.ones(5))
+    found, correlation = align(pyramid, templates, warp, px)
+    assert found.shape == (5, 2)
+    assert correlation[0] > 0.99
+    assert not (correlation[1:] > 0.85).any()
 
 
 def test_a_variable_turns_compiled_loops_off(without_numba: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slamdepth.frontend.compiled import loops
 from slamdepth.typing import Bools, Bytes, Floats, Floats32, Ints
 
 _HALF = 4  # a patch has 9 x 9 samples
@@ -52,6 +53,17 @@ class ImagePyramid:
             even = _smoothed(self._levels[-1])[: height // 2 * 2, : width // 2 * 2]
             half = cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
             self._levels.append(np.asarray(half, np.float32))
+
+    @property
+    def levels(self) -> tuple[Floats32, ...]:
+        """The image and smaller ones, the largest first; where it is small, the last one more than once."""
+        missing = _LEVELS - len(self._levels)
+        return (*self._levels, *self._levels[-1:] * missing)
+
+    @property
+    def count(self) -> int:
+        """Number of different levels."""
+        return len(self._levels)
 
     def sample(self, px: Floats, spacing_px: Floats) -> Floats32:
         """Grey values ``(N, S)`` at pixels ``(N, S, 2)``, smoothed as their ``spacing_px (N,)`` asks."""
@@ -138,6 +150,28 @@ def align(image: ImagePyramid, templates: Templates, warp: Floats, px: Floats) -
     Returns:
         Pixels ``(N, 2)``, and the weighted correlation ``(N,)`` of what is there with the template.
     """
+    if (fast := loops()) is not None:
+        found_px, correlation = fast.alignment.align(
+            image.levels,
+            image.count,
+            templates.values,
+            templates.gradient,
+            templates.inverse,
+            templates.spacing_px.astype(np.float64),
+            np.ascontiguousarray(warp, np.float64),
+            np.ascontiguousarray(px, np.float64),
+            _OFFSETS,
+            _WEIGHTS,
+            _STEPS,
+            _CONVERGED_PX,
+            _LONGEST_STEP,
+        )
+        return np.asarray(found_px), np.asarray(correlation)
+    return _align(image, templates, warp, px)
+
+
+def _align(image: ImagePyramid, templates: Templates, warp: Floats, px: Floats) -> tuple[Floats, Floats]:
+    """:func:`align` without compiled loops."""
     px = np.array(px, dtype=np.float64)
     offsets = np.einsum("nij,sj->nsi", warp, _OFFSETS) * templates.spacing_px[:, None, None]
     spacing = templates.spacing_px * np.sqrt(np.abs(np.linalg.det(warp)))

@@ -25,6 +25,7 @@ class Loops:
     """The compiled loops, as modules of functions.
 
     Attributes:
+        alignment: see :mod:`slamdepth.frontend.compiled.alignment`.
         visible: see :mod:`slamdepth.frontend.compiled.visible`.
         matching: see :mod:`slamdepth.frontend.compiled.matching`.
         pose: see :mod:`slamdepth.frontend.compiled.pose`.
@@ -32,6 +33,7 @@ class Loops:
         retain: see :mod:`slamdepth.frontend.compiled.retain`.
     """
 
+    alignment: Any
     visible: Any
     matching: Any
     pose: Any
@@ -48,6 +50,7 @@ def load() -> None:
     """Compile what tracking needs, or read it from the cache, so that no frame waits for it."""
     if (fast := loops()) is not None:
         log.info("loading compiled loops (the first run compiles them, for some 15 seconds)")
+        fast.alignment.load()
         fast.visible.load()
         fast.matching.load()
         fast.pose.load()
@@ -58,8 +61,8 @@ def _loops() -> Loops | None:
     if importlib.util.find_spec("numba") is None:
         return None
     try:
-        from slamdepth.frontend.compiled import matching, orb, pose, retain, visible
+        from slamdepth.frontend.compiled import alignment, matching, orb, pose, retain, visible
     except ImportError as error:  # a numba that this NumPy is too new for
         log.warning("numba cannot be used, tracking takes twice as long: %s", error)
         return None
-    return Loops(visible=visible, matching=matching, pose=pose, orb=orb, retain=retain)
+    return Loops(alignment=alignment, visible=visible, matching=matching, pose=pose, orb=orb, retain=retain)
