@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from bags import BagWriter
-from command_line import call, images, leave_out_plots, slamdepth
+from command_line import call, copy_of, images, leave_out_plots, slamdepth
 
 from slamdepth import Map, open_dataset
 from slamdepth.io import read_tum_trajectory
@@ -94,6 +94,42 @@ def test_a_sequence_is_placed_in_the_map(run_folder: Path, tiny_room: Path, tmp_
     assert digest(run_folder / "map") == before
     again = call("localize", "--map", run_folder, tiny_room, "--output", out)
     assert (again.returncode, "add --overwrite" in again.stderr) == (2, True)
+
+
+@pytest.fixture(scope="module")
+def without_camera(tiny_room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    sequence = copy_of(tiny_room, tmp_path_factory.mktemp("no-camera") / "walk")
+    (sequence / "camera.yaml").unlink()
+    return sequence
+
+
+def test_a_sequence_without_a_camera_has_that_of_the_map(
+    run_folder: Path, without_camera: Path, tmp_path: Path
+) -> None:
+    done = call("localize", "--map", run_folder, without_camera, "-o", tmp_path / "found", "--max-frames", 4)
+    assert done.returncode == 0, done.stderr
+    assert "unknown" not in done.stderr
+    notes = json.loads((tmp_path / "found" / "localized.json").read_text())["notes"]
+    assert any("intrinsics are those of the map, since those of the sequence are guessed" in n for n in notes)
+
+
+def test_a_run_in_a_map_has_its_camera_where_the_recording_tells_none(
+    run_folder: Path, without_camera: Path, tmp_path: Path
+) -> None:
+    options = ("--depth", "sensor", "--no-mesh", "--max-frames", 20, "--map-images")
+    done = call("run", without_camera, "--map", run_folder, "-o", tmp_path / "again", *options)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "again" / "report.json").read_text())
+    saved, own = Map.load(run_folder).camera, Map.load(tmp_path / "again").camera
+    assert (own.fx, own.fy, own.cx, own.cy) == (saved.fx, saved.fy, saved.cx, saved.cy)
+    assert (report["camera"]["certainty"], report["camera"]["source"]) == ("given", "the map's camera")
+    assert any("intrinsics are those of the map" in note for note in report["notes"])
+    assert "finding the focal length" not in done.stderr
+    assert "unknown" not in done.stderr
+    asked = call("run", without_camera, "--map", run_folder, "-o", tmp_path / "fov", *options, "--fov", 70)
+    assert asked.returncode == 0, asked.stderr
+    report = json.loads((tmp_path / "fov" / "report.json").read_text())
+    assert "--fov 70" in report["camera"]["source"]
 
 
 def test_one_image_is_placed_with_the_camera_of_the_map(

@@ -88,6 +88,21 @@ def test_other_odometry_keeps_the_guess(without_camera: Path) -> None:
     assert "give --fov or --camera" in facts.sentence
 
 
+def test_an_interrupted_search_finds_nothing_out(
+    without_camera: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    dataset = open_dataset(without_camera)
+    guess = dataset.camera
+    stop = threading.Event()
+    stop.set()
+    with caplog.at_level("INFO"):
+        opening = settle_camera(dataset, range(20), SensorDepth(), Config(), lambda _: None, stop)
+    assert dataset.camera == guess
+    assert opening.sigma_log_f == GUESSED_SIGMA
+    assert "interrupted before the focal length was found" in caplog.text
+    assert "does not show" not in caplog.text
+
+
 def test_what_the_motion_does_not_show_is_said() -> None:
     opening = OpeningCamera(GUESSED, Prior(GUESS.fx, 0.35), 0.35)
     facts = CameraFacts(GUESS, opening.source, replace(GUESS, fx=700.0, fy=700.0), 0.35)

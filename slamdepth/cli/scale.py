@@ -58,6 +58,7 @@ def scale_command(
     from rich.progress import Progress
 
     from slamdepth.datasets import ReadOptions, open_dataset
+    from slamdepth.datasets.intrinsics import tell_guess
     from slamdepth.datasets.sensor_depth import lack_of_depth
     from slamdepth.depth.registry import create_depth_model
     from slamdepth.depth.scale import check_can_fit, fit_scale
@@ -74,6 +75,7 @@ def scale_command(
             f"{sequence}: {lack_of_depth(dataset)}, so no scale can be fitted; 'slamdepth run SEQ "
             "--depth-scale groundtruth' can take a scale from a ground truth trajectory"
         )
+    tell_guess(dataset.name, dataset.camera_source)
     if output is not None:
         output = writable_file(output, ".yaml")
     model = create_depth_model(depth, device=device, weights=depth_weights)

@@ -106,14 +106,14 @@ def intrinsics_of(width: int, height: int, focal_35mm: float | None = None) -> I
 
 def intrinsics_of_images(path: Path, width: int, height: int) -> tuple[Camera, CameraSource]:
     """The camera of images like ``path``, of this upright size, without a camera file: by EXIF or a guess."""
-    return _named(path, intrinsics_of(width, height, exif_focal_35mm(path)))
+    return _named(intrinsics_of(width, height, exif_focal_35mm(path)))
 
 
 def intrinsics_of_video(path: Path, width: int, height: int) -> tuple[Camera, CameraSource]:
     """The camera of a video of this upright size without a camera file: by its metadata or a guess."""
     focal_35mm = video_focal_35mm(path)
     if focal_35mm is None:
-        return _named(path, intrinsics_of(width, height))
+        return _named(intrinsics_of(width, height))
     focal_px = focal_35mm * _OF_A_VIDEO * max(width, height) / _FULL_FRAME_DIAGONAL_MM
     how = (
         f"the video's metadata: as {focal_35mm:g} mm on 35 mm film, {_px(focal_px, width, height)} if the "
@@ -123,14 +123,18 @@ def intrinsics_of_video(path: Path, width: int, height: int) -> tuple[Camera, Ca
     return camera, CameraSource(Certainty.NOMINAL, how, _VIDEO_SIGMA)
 
 
+def tell_guess(name: str, source: CameraSource) -> None:
+    """Log that the intrinsics of a sequence of this name are a guess, where they are and will be used."""
+    if source.certainty is Certainty.GUESSED:
+        _log.warning("%s: the intrinsics are unknown; taken is %s", name, source.how)
+
+
 def _px(focal_px: float, width: int, height: int) -> str:
     """A focal length with the size of its pixels: frames may be tracked at another one."""
     return f"{focal_px:.1f} px at {width}x{height}"
 
 
-def _named(path: Path, found: Intrinsics) -> tuple[Camera, CameraSource]:
-    if found.certainty is Certainty.GUESSED:
-        _log.warning("%s: the intrinsics are unknown; taken is %s", path.name, found.how)
+def _named(found: Intrinsics) -> tuple[Camera, CameraSource]:
     return found.camera, CameraSource(found.certainty, found.how)
 
 

@@ -22,7 +22,7 @@ from slamdepth.backend.self_calibration_passes import FocalLength, Pass, focal_l
 from slamdepth.backend.sights import Sights
 from slamdepth.config import Config
 from slamdepth.datasets import Dataset
-from slamdepth.datasets.intrinsics import CameraSource, Certainty, camera_of_view
+from slamdepth.datasets.intrinsics import CameraSource, Certainty, camera_of_view, tell_guess
 from slamdepth.datasets.virtual_view import ViewedSequence
 from slamdepth.depth.base import DepthModel, is_sensor
 from slamdepth.errors import CameraError, ImageDecodeError
@@ -125,6 +125,7 @@ def settle_camera(
     prior = prior_of(guess.fx, source, config)
     sigma = prior.sigma_log_f
     logger.info("intrinsics are not given: %s", source.how)
+    tell_guess(dataset.path.name, source)
     if config.odometry != "orb" or dataset.is_live:
         return OpeningCamera(source, None, sigma)
     windows: list[_Window] = []
@@ -157,7 +158,10 @@ def settle_camera(
     if _is_observed(opening, prior):
         dataset.camera = best
         return OpeningCamera(source, prior, opening, said)
-    logger.warning("the motion of the first windows does not show the focal length")
+    if stop.is_set():
+        logger.info("interrupted before the focal length was found")
+    else:
+        logger.warning("the motion of the first windows does not show the focal length")
     dataset.camera = guess
     return OpeningCamera(source, prior, sigma, said)
 

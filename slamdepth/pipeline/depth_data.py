@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from slamdepth.datasets import Dataset, ReadOptions, open_dataset
+from slamdepth.datasets.intrinsics import tell_guess
 from slamdepth.datasets.sensor_depth import check_sensor_depth, lack_of_depth
 from slamdepth.errors import DatasetError
 from slamdepth.pipeline.training_data import SequencePlace, sequence_readers
@@ -85,6 +86,7 @@ def _with_depth(datasets: list[Dataset]) -> list[Place]:
             logger.warning("%s: left out, %s", dataset.path, lack_of_depth(dataset))
     places: list[SequencePlace] = [SequencePlace.of(dataset) for dataset in with_depth]
     for place in places:
+        tell_guess(place.name, place.dataset.camera_source)
         for note in check_sensor_depth(place.dataset, place.frames):
             logger.warning("%s: %s", place.name, note)
     return [*places]

@@ -32,6 +32,7 @@ from slamdepth.pipeline.prediction_scale import (
     check_scale_options,
     choose_prediction_scale,
 )
+from slamdepth.pipeline.saved_maps import use_camera_of_map
 from slamdepth.pipeline.seeds import seed_everything, seed_torch
 from slamdepth.pipeline.tracking import AnyTracker
 from slamdepth.tracking import Tracker
@@ -96,6 +97,8 @@ def prepare(
     dataset = open_dataset(options.sequence, options.camera_file, options.reading)
     if options.view_deg is not None:
         use_view(dataset, options.view_deg)
+    elif start_map is not None:
+        use_camera_of_map(dataset, start_map)
     indices = options.indices_of(dataset)
     if dataset.imu_path is not None and config.scale.imu is None:
         dataset.notes.append(f"inertial data is there, for scale and gravity: --imu {dataset.imu_path}")

@@ -19,6 +19,7 @@ from slamdepth.config import Config
 from slamdepth.datasets import ReadOptions, open_dataset
 from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.image_files import IMAGE_ENDINGS
+from slamdepth.datasets.intrinsics import tell_guess
 from slamdepth.datasets.readers.live import LiveReader
 from slamdepth.datasets.virtual_view import as_pinhole
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
@@ -29,7 +30,7 @@ from slamdepth.mapstore import Map
 from slamdepth.pipeline.folder import make_folder
 from slamdepth.pipeline.options import check_frames_asked
 from slamdepth.pipeline.prefetch import FramePrefetcher
-from slamdepth.pipeline.saved_maps import camera_for
+from slamdepth.pipeline.saved_maps import use_camera_of_map
 from slamdepth.tracking import MapLocaliser
 from slamdepth.types import Camera, Frame, StepResult, TrackingStatus, Trajectory
 
@@ -135,14 +136,13 @@ def localize(
         )
     dataset = open_dataset(path, camera, reading)
     indices = range(0, len(dataset), stride)[:max_frames]
-    used = camera_for(dataset, saved)
+    use_camera_of_map(dataset, saved)
+    tell_guess(dataset.name, dataset.camera_source)
     notes = list(dataset.notes)
-    if used != dataset.camera:
-        notes.append(f"intrinsics are those of the map, since those of the sequence are {_how(dataset)}")
     start = time.perf_counter()
     steps: list[StepResult] = []
     skipped = 0
-    with MapLocaliser(saved, used, config) as localiser:
+    with MapLocaliser(saved, dataset.camera, config) as localiser:
         notes += _note_on_images(saved, localiser)
         reader = FramePrefetcher(dataset, indices, with_depth=False, prepare=localiser.prepare)
         with reader:
@@ -151,8 +151,7 @@ def localize(
                     skipped += 1
                     logger.warning("image skipped: %s", item)
                     continue
-                frame = item.frame if item.frame.camera == used else replace(item.frame, camera=used)
-                steps.append(localiser.step(frame, item.prepared))
+                steps.append(localiser.step(item.frame, item.prepared))
                 tell(len(steps) + skipped, len(indices), steps[-1])
         trajectory, quality = localiser.finish(), localiser.quality()
     if not steps:
@@ -161,10 +160,6 @@ def localize(
         notes.append(f"interrupted after {len(steps) + skipped} of {len(indices)} frames")
     fps = len(steps) / max(1e-9, time.perf_counter() - start)
     return Localisation(_settled(steps, trajectory, quality), trajectory, skipped, fps, tuple(notes))
-
-
-def _how(dataset: Any) -> str:
-    return f"{dataset.camera_source.certainty.value} ({dataset.camera_source.how})"
 
 
 def _until(reader: FramePrefetcher, stop: Callable[[], bool] | None) -> Iterator[Any]:

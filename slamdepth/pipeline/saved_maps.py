@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from slamdepth.datasets import Dataset
-from slamdepth.datasets.intrinsics import Certainty
+from slamdepth.datasets.intrinsics import CameraSource, Certainty
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapstore import Map, Session
 from slamdepth.pipeline.folder import MAP, RunFolder
@@ -18,21 +18,27 @@ from slamdepth.pipeline.tracking import AnyTracker
 from slamdepth.report import ScaleFacts, ScaleSource
 from slamdepth.tracking import Tracker
 from slamdepth.tracking.saved_maps import same_lens
-from slamdepth.types import Camera
 
 logger = logging.getLogger(__name__)
 
 
-def camera_for(dataset: Dataset, saved: Map) -> Camera:
-    """The camera of frames that are looked for in a map: the map's, where the sequence knows none.
+def use_camera_of_map(dataset: Dataset, saved: Map) -> None:
+    """Give a dataset the camera of a map, where it knows none of its own, and note that.
 
     Intrinsics that are not given by a file and belong to images of the map's size are likely the map's.
     """
-    own, theirs = dataset.camera, saved.camera
-    is_given = dataset.camera_source.certainty is Certainty.GIVEN
-    if is_given or same_lens(own, theirs) or (own.width, own.height) != (theirs.width, theirs.height):
-        return own
-    return replace(theirs, fps=own.fps, depth_factor=own.depth_factor)
+    own, theirs, source = dataset.camera, saved.camera, dataset.camera_source
+    if source.certainty is Certainty.GIVEN or (own.width, own.height) != (theirs.width, theirs.height):
+        return
+    if not same_lens(own, theirs):
+        dataset.camera = replace(theirs, fps=own.fps, depth_factor=own.depth_factor)
+        note = (
+            f"intrinsics are those of the map, since those of the sequence are {source.certainty.value} "
+            f"({source.how})"
+        )
+        dataset.notes.append(note)
+        logger.info("%s", note)
+    dataset.camera_source = CameraSource(Certainty.GIVEN, "the map's camera")
 
 
 def inherited_scale(facts: ScaleFacts, tracker: AnyTracker, number: int, saved: Map | None) -> ScaleFacts:

@@ -16,7 +16,13 @@ from typing import TYPE_CHECKING, Protocol
 
 from slamdepth.datasets import Dataset, ReadOptions, known_readers, open_dataset
 from slamdepth.datasets.image_files import IMAGE_ENDINGS, list_images, read_image_frame, short_names
-from slamdepth.datasets.intrinsics import Certainty, Intrinsics, find_camera_file, intrinsics_of
+from slamdepth.datasets.intrinsics import (
+    Certainty,
+    Intrinsics,
+    find_camera_file,
+    intrinsics_of,
+    tell_guess,
+)
 from slamdepth.datasets.orientation import fitted_camera
 from slamdepth.datasets.video import VIDEO_ENDINGS, VideoFile
 from slamdepth.datasets.virtual_view import as_pinhole
@@ -239,6 +245,7 @@ class _SequenceSource:
         self._indices = range(len(dataset))[chosen]
         self._dataset = dataset
         source = dataset.camera_source
+        tell_guess(dataset.name, source)
         how = "the sequence's own camera" if source.certainty is Certainty.GIVEN else source.how
         self._intrinsics = Intrinsics(dataset.camera, how, source.certainty)
 
