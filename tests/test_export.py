@@ -19,7 +19,7 @@ from wide_world import wide_camera
 
 import slamdepth as package
 from slamdepth.datasets import Dataset, open_dataset
-from slamdepth.errors import ConfigError, DatasetError, InputError, OutputError
+from slamdepth.errors import ConfigError, DatasetError, InputError, OutputError, TrackingError
 from slamdepth.export import FORMATS, ExportRequest, ExportScene, ImageMode, View, write_export
 from slamdepth.export.formats.euroc import nanoseconds
 from slamdepth.export.images import ExportImages
@@ -315,6 +315,20 @@ def test_a_format_that_fails_stops_no_other(result: RunResult, tmp_path: Path) -
     assert "not exported to obj: " in done.stderr
     assert sorted(path.name for path in (run / "export").iterdir()) == ["kitti", "tum"]
     assert str(run / "export" / "tum") in done.stdout.replace("\n", "")
+
+
+def test_what_no_input_can_mend_has_another_exit_code(
+    result: RunResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(run: Path, to: str, *_: object, **__: object) -> Path:
+        if to == "tum":
+            return tmp_path
+        raise TrackingError("it cannot be done") if to == "kitti" else InputError("it lacks something")
+
+    monkeypatch.setattr("slamdepth.pipeline.export.export_run", fails)
+    done = call("export", result.folder, "--to", "tum,kitti")
+    assert (done.returncode, "not exported to kitti: it cannot be done" in done.stderr) == (1, True)
+    assert call("export", result.folder, "--to", "tum,kitti,ply").returncode == 2
 
 
 def test_what_fails_for_every_format_is_said_once(tmp_path: Path) -> None:

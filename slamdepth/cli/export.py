@@ -99,4 +99,6 @@ def export_command(
     first = next(iter(errors.values()))
     if not folders and len({str(error) for error in errors.values()}) == 1:
         raise first
-    raise InputError("; ".join(f"not exported to {name}: {error}" for name, error in errors.items()))
+    is_input = any(error.exit_code == InputError.exit_code for error in errors.values())
+    kind = InputError if is_input else SlamdepthError
+    raise kind("; ".join(f"not exported to {name}: {error}" for name, error in errors.items()))

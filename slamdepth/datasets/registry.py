@@ -154,8 +154,12 @@ def open_dataset(
             f"{path}: no known sequence layout, but it holds {len(inside)} video{'s' * (len(inside) > 1)}: "
             f"name one, such as '{inside[0]}'"
         )
-    layouts = "; ".join(f"{reader.name} ({reader.needs})" for reader in readers)
-    raise DatasetError(f"{path}: no known sequence layout; known are: {layouts}")
+    if not any(path.iterdir()):
+        raise DatasetError(f"{path}: is empty; name a video, a folder of images, or a data set")
+    raise DatasetError(
+        f"{path}: no known sequence layout: neither a folder of images, nor one of the "
+        f"{len(known_readers())} layouts that docs/inputs.md lists"
+    )
 
 
 def _opened(reader: Reader, path: Path, camera: Camera | None, options: ReadOptions) -> Dataset:
