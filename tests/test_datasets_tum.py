@@ -168,8 +168,8 @@ def test_folders_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert "is a file" in error_of(tmp_path / "file")
     message = error_of(tmp_path)
-    assert "tum (rgb.txt" in message
-    assert "7scenes (frame-NNNNNN.color" in message
+    assert "no known sequence layout" in message
+    assert "docs/inputs.md" in message
 
 
 def test_missing_list(tmp_path: Path) -> None:
