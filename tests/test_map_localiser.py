@@ -108,13 +108,33 @@ def test_a_long_recording_is_adjusted_by_some_of_its_frames(
     assert rmse_m(index, found[1]) < 1.5 * rmse_m(index, found[0])
 
 
-def test_a_damaged_image_of_the_map_is_named() -> None:
-    saved = half_with_images()
+def with_damaged_images(saved: Map, count: int) -> Map:
+    """A map whose first ``count`` images do not decode."""
     images = dict(saved.groups["images"])
-    images["jpeg"] = np.zeros_like(images["jpeg"])
-    damaged = replace(saved, groups={**saved.groups, "images": images})
-    with MapLocaliser(damaged) as localiser, pytest.raises(DatasetError, match="the map's image of frame"):
-        localiser.step(frames([2])[0])
+    images["jpeg"] = images["jpeg"].copy()
+    images["jpeg"][: images["first_byte"][count]] = 0
+    return replace(saved, groups={**saved.groups, "images": images})
+
+
+def test_a_damaged_image_of_the_map_is_named_once_and_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    saved, given = half_with_images(), frames(range(4))
+    every, index = len(saved.groups["images"]["keyframe"]), [frame.index for frame in given]
+    poses = []
+    for count in (0, 1, every):
+        caplog.clear()
+        with MapLocaliser(with_damaged_images(saved, count)) as localiser:
+            for frame in given:
+                localiser.step(frame)
+            placed = localiser.finish()
+            named = [
+                record.message for record in caplog.records if "the map's image of frame" in record.message
+            ]
+            assert len(named) == len(set(named)) == localiser.damaged_images <= count
+            assert (localiser.damaged_images > 0) is (count > 0)
+        assert len(placed) == len(given)
+        assert rmse_m(index, placed.T_world_camera) < 0.02
+        poses.append(placed.T_world_camera)
+    assert not np.array_equal(poses[1], poses[2])  # keypoints are still aligned in the other images
 
 
 def test_a_camera_that_was_scaled_to_the_size_of_the_map_is_that_of_the_map() -> None:

@@ -143,7 +143,6 @@ def localize(
     steps: list[StepResult] = []
     skipped = 0
     with MapLocaliser(saved, dataset.camera, config) as localiser:
-        notes += _note_on_images(saved, localiser)
         reader = FramePrefetcher(dataset, indices, with_depth=False, prepare=localiser.prepare)
         with reader:
             for item in _until(reader, stop):
@@ -154,6 +153,7 @@ def localize(
                 steps.append(localiser.step(item.frame, item.prepared))
                 tell(len(steps) + skipped, len(indices), steps[-1])
         trajectory, quality = localiser.finish(), localiser.quality()
+        notes += _notes_on_images(saved, localiser)
     if not steps:
         raise DatasetError(f"{path}: none of the {len(indices)} images decodes")
     if len(steps) + skipped < len(indices):
@@ -227,15 +227,17 @@ def _localize_image(
     start = time.perf_counter()
     with MapLocaliser(saved, camera, config) as localiser:
         step = localiser.place(Frame(0, 0.0, image_rgb, camera))
-        notes += _note_on_images(saved, localiser)
+        notes += _notes_on_images(saved, localiser)
     found = step.T_world_camera
     poses = np.zeros((0, 4, 4)) if found is None else found[None]
     trajectory = Trajectory(np.zeros(len(poses)), poses)
     return Localisation((step,), trajectory, 0, 1.0 / (time.perf_counter() - start), notes)
 
 
-def _note_on_images(saved: Map, localiser: MapLocaliser) -> tuple[str, ...]:
-    """What is said where the map has images, and keypoints cannot be aligned in them."""
+def _notes_on_images(saved: Map, localiser: MapLocaliser) -> tuple[str, ...]:
+    """What is said where the map has images, and keypoints cannot be aligned in them, or in some."""
+    if damaged := localiser.damaged_images:
+        return (f"{damaged} images of the map are damaged: keypoints are not aligned in them",)
     if not saved.has_images or localiser.has_images:
         return ()
     return ("keypoints are not aligned in the map's images: another camera, or size, has taken them",)

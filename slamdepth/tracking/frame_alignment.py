@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import logging
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slamdepth.errors import DatasetError
 from slamdepth.frontend.features import Features, ScaleLevels
 from slamdepth.frontend.patch_alignment import ImagePyramid, Templates, align_near, facing_warp
 from slamdepth.mapping.map import Map
@@ -15,6 +17,8 @@ from slamdepth.mapping.placement import Placement
 from slamdepth.tracking.keypoint_alignment import ALIGNED_SHARE, FARTHEST, References
 from slamdepth.types import Frame
 from slamdepth.typing import Ints
+
+logger = logging.getLogger(__name__)
 
 _TEMPLATES = 30_000  # in memory at a time, 1 kB each
 
@@ -30,7 +34,10 @@ class _View:
 class FrameAligner:
     """Moves keypoints of placed frames to where the map's keyframes show their landmarks.
 
-    A landmark that one keyframe sees is aligned to that one.
+    A landmark that one keyframe sees is aligned to that one. Images that do not decode are left out.
+
+    Attributes:
+        damaged: numbers of the keyframes whose images were left out so far.
 
     Args:
         map_: whose keyframes took their images with the camera of the frames, and does not change.
@@ -42,6 +49,7 @@ class FrameAligner:
         self._levels = levels
         self._references = References.of(map_, views=1)
         self._views: OrderedDict[int, _View] = OrderedDict()
+        self.damaged: set[int] = set()
 
     def __call__(self, frame: Frame, raw: Features, placement: Placement) -> Features:
         """The features ``raw`` of a placed frame at aligned pixels, which are more certain."""
@@ -54,6 +62,8 @@ class FrameAligner:
         raw_px, sigma_px = raw.raw_px.copy(), raw.sigma_px.copy()
         for k in used:
             view = self._view(k)
+            if view is None:
+                continue
             own = at[number == k]
             place = np.searchsorted(view.ids, placement.landmark_ids[own])
             own, place = own[view.templates.is_usable[place]], place[view.templates.is_usable[place]]
@@ -74,16 +84,23 @@ class FrameAligner:
         px = frame.camera.undistort_points(raw_px)
         return replace(raw, raw_px=raw_px, px=px, sigma_px=sigma_px)
 
-    def _view(self, number: int) -> _View:
-        """The patches of a keyframe, which are made when they are asked for first."""
+    def _view(self, number: int) -> _View | None:
+        """The patches of a keyframe, which are made when they are asked for first; None without its image."""
         view = self._views.get(number)
         if view is None:
+            if number in self.damaged:
+                return None
             keyframe = self._map.keyframes[number]
+            try:
+                image = ImagePyramid(keyframe.frame.load_as_spilled())
+            except DatasetError as error:
+                self.damaged.add(number)
+                logger.warning("keypoints are not aligned in one image: %s", error)
+                return None
             features: Features = keyframe.features
             ids = np.flatnonzero(self._references.keyframe == number)
             at = self._references.feature[ids]
             spacing_px = np.sqrt(self._levels.sigma_px(features.octave[at]))
-            image = ImagePyramid(keyframe.frame.load_as_spilled())
             view = self._views[number] = _View(ids, Templates.of(image, features.raw_px[at], spacing_px))
         self._views.move_to_end(number)
         return view

@@ -73,8 +73,9 @@ class MapLocaliser:
         )
         self._map = MapTracker(0, run)
         load_map(map, self._map, self.camera, config.features)
+        self._aligner: FrameAligner | None = None
         if any(keyframe.frame.is_kept for keyframe in self._map.map.keyframes):
-            self._map.aligner = FrameAligner(self._map.map, self._prepare.levels)
+            self._aligner = self._map.aligner = FrameAligner(self._map.map, self._prepare.levels)
         self._last_time_s = -np.inf
         self._closed = False
         load()
@@ -82,7 +83,12 @@ class MapLocaliser:
     @property
     def has_images(self) -> bool:
         """Whether the map has images of this camera, in which keypoints are aligned."""
-        return self._map.aligner is not None
+        return self._aligner is not None
+
+    @property
+    def damaged_images(self) -> int:
+        """Images of the map that did not decode when they were asked for, and were left out."""
+        return 0 if self._aligner is None else len(self._aligner.damaged)
 
     def prepare(self, frame: Frame) -> Prepared:
         """The features of a frame, which another thread may find ahead of :meth:`step`."""
