@@ -396,6 +396,17 @@ def test_a_folder_of_something_else_is_never_replaced(result: RunResult, tmp_pat
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
+def test_a_mesh_that_cannot_be_read_is_named(result: RunResult, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(result.folder, run, ignore=shutil.ignore_patterns("export"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Path, "is_file", lambda path: True)  # gone by the time it is copied
+        (run / "cloud.ply").unlink()
+        with pytest.raises(InputError, match=r"cloud\.ply: cannot be read: No such file"):
+            package.export_run(run, "ply", tmp_path / "ply")
+    assert not (tmp_path / "ply").exists()
+
+
 def test_an_export_is_replaced_whole(result: RunResult, tmp_path: Path) -> None:
     for name in ("kitti", "tum"):
         package.export_run(result.folder, name, tmp_path / "out", overwrite=True)

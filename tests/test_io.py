@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from enum import Enum
 from pathlib import Path
 
@@ -21,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from sequences import depth_raw, image_rgb, poses, write_image
 
 import slamdepth.io
-from slamdepth.errors import DatasetError, ImageDecodeError, OutputError
+from slamdepth.errors import DatasetError, ImageDecodeError, InputError, OutputError
 from slamdepth.io import (
     TrajectoryWriter,
     format_timestamp,
@@ -35,6 +39,7 @@ from slamdepth.io import (
     write_tum_trajectory,
 )
 from slamdepth.io.image_end import is_cut_short
+from slamdepth.io.text import replacing_folder
 from slamdepth.types import Trajectory
 
 RELAXED = settings(
@@ -424,6 +429,21 @@ def test_text_is_whole_or_absent(tmp_path: Path) -> None:
             write_text(bad, "x")
         assert "\n" not in str(caught.value)
     assert os.listdir(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize("replace", [replacing, replacing_folder])
+def test_what_cannot_be_read_is_not_said_to_be_unwritable(
+    replace: Callable[[Path], AbstractContextManager[Path]], tmp_path: Path
+) -> None:
+    source, place = tmp_path / "source.ply", tmp_path / "out"
+    with pytest.raises(InputError) as caught, replace(place) as temporary:
+        shutil.copyfile(source, temporary / "x" if temporary.is_dir() else temporary)
+    assert str(caught.value) == f"{source}: cannot be read: No such file or directory"
+    assert not isinstance(caught.value, OutputError)
+    full = OSError(errno.ENOSPC, "No space left on device", str(source), None, str(place / "x"))
+    with pytest.raises(OutputError, match="out: cannot be written: No space left"), replace(place):
+        raise full  # as a copy does
+    assert os.listdir(tmp_path) == []
 
 
 def test_new_files_have_ordinary_permissions(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -18,7 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from slamdepth.errors import DatasetError, OutputError
+from slamdepth.errors import DatasetError, InputError, OutputError
+
+_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Errors of what is written, whichever file they name: that of a copy names the one that is copied."""
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
@@ -78,19 +82,42 @@ def parse_float(text: str) -> float:
 
 
 @contextmanager
+def writing(path: str | Path, temporary: Path | None = None) -> Iterator[None]:
+    """Turn what the system says against writing to ``path`` into one clear error.
+
+    Args:
+        temporary: where it is written first.
+
+    Raises:
+        OutputError: the block raised an OSError.
+        InputError: it raised one of another file, which could not be read.
+    """
+    try:
+        yield
+    except OSError as error:
+        why, source = error.strerror or error, error.filename
+        if isinstance(source, str) and error.errno not in _OF_THE_DISK:
+            place = Path(source).absolute()
+            own = [Path(path).absolute(), *([] if temporary is None else [temporary])]
+            if not any(place.is_relative_to(one) or one.is_relative_to(place) for one in own):
+                raise InputError(f"{source}: cannot be read: {why}") from error
+        raise OutputError(f"{path}: cannot be written: {why}") from error
+
+
+@contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """A temporary path with the same ending, moved to ``path`` when the block succeeds.
 
     Raises:
         OutputError: ``path`` cannot be written; nothing is left behind.
+        InputError: another file cannot be read; the same.
     """
     place = Path(path).absolute()
     temporary = place.with_name(f".{place.stem}.{secrets.token_hex(4)}.partial{place.suffix}")
     try:
-        yield temporary
-        os.replace(temporary, place)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        with writing(path, temporary):
+            yield temporary
+            os.replace(temporary, place)
     finally:
         with suppress(OSError):  # such as a folder that is no folder: that error is on its way
             temporary.unlink(missing_ok=True)
@@ -102,19 +129,19 @@ def replacing_folder(folder: str | Path) -> Iterator[Path]:
 
     Raises:
         OutputError: ``folder`` cannot be written; what was there stays, and nothing else is left behind.
+        InputError: a file elsewhere cannot be read; the same.
     """
     place = Path(folder).absolute()
     made = list(takewhile(lambda above: not above.exists(), place.parents))
     partial = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
     before = partial.with_suffix(".before")
     try:
-        partial.mkdir(parents=True)
-        yield partial
-        if place.exists():
-            os.replace(place, before)
-        os.replace(partial, place)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+        with writing(folder, partial):
+            partial.mkdir(parents=True)
+            yield partial
+            if place.exists():
+                os.replace(place, before)
+            os.replace(partial, place)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
         with suppress(OSError):

@@ -16,6 +16,7 @@ from pathlib import Path
 from slamdepth.errors import OutputError
 from slamdepth.export import is_export
 from slamdepth.io import results_folder, writable, write_text
+from slamdepth.io.text import writing
 from slamdepth.mapstore import remove_map
 from slamdepth.pipeline import checkpoint
 from slamdepth.report.saved_run import map_folder
@@ -270,16 +271,3 @@ def make_folder(path: Path) -> None:
     """
     with writing(path):
         path.mkdir(parents=True, exist_ok=True)
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn what the system says against writing to ``path`` into one clear error.
-
-    Raises:
-        OutputError: the block raised an OSError.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error

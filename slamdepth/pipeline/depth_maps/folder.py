@@ -11,7 +11,8 @@ from typing import Any
 
 from slamdepth.errors import ConfigError, OutputError
 from slamdepth.io import writable, write_json, write_text
-from slamdepth.pipeline.folder import make_folder, writing
+from slamdepth.io.text import writing
+from slamdepth.pipeline.folder import make_folder
 from slamdepth.types import DepthKind
 
 ABOUT = "depth.json"
