@@ -13,8 +13,9 @@ import pytest
 from bags import BagWriter
 from command_line import call, copy_of, images, leave_out_plots, slamdepth
 
-from slamdepth import Map, open_dataset
+from slamdepth import Map, localize, open_dataset
 from slamdepth.io import read_tum_trajectory
+from slamdepth.pipeline.options import RunInterrupted
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +76,13 @@ def test_a_live_source_is_not_placed(run_folder: Path, tmp_path: Path) -> None:
     assert done.returncode == 2
     assert "is a live source; only recordings are placed" in done.stderr
     assert "secret" not in done.stderr
+
+
+def test_an_interrupt_before_the_first_frame_is_no_fault_of_the_images(
+    run_folder: Path, tiny_room: Path
+) -> None:
+    with pytest.raises(RunInterrupted, match="before the first frame"):
+        localize(run_folder, tiny_room, stop=lambda: True)
 
 
 def test_a_sequence_is_placed_in_the_map(run_folder: Path, tiny_room: Path, tmp_path: Path) -> None:

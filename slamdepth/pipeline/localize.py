@@ -28,7 +28,7 @@ from slamdepth.io.images import read_image_rgb
 from slamdepth.io.trajectory import format_timestamp
 from slamdepth.mapstore import Map
 from slamdepth.pipeline.folder import make_folder
-from slamdepth.pipeline.options import check_frames_asked
+from slamdepth.pipeline.options import RunInterrupted, check_frames_asked
 from slamdepth.pipeline.prefetch import FramePrefetcher
 from slamdepth.pipeline.saved_maps import use_camera_of_map
 from slamdepth.tracking import MapLocaliser
@@ -122,6 +122,7 @@ def localize(
 
     Raises:
         InputError: the map, the source or its camera is wrong.
+        RunInterrupted: ``stop`` was true before the first frame.
     """
     check_frames_asked(stride, max_frames)
     saved = map if isinstance(map, Map) else Map.load(map)
@@ -154,6 +155,8 @@ def localize(
                 tell(len(steps) + skipped, len(indices), steps[-1])
         trajectory, quality = localiser.finish(), localiser.quality()
         notes += _notes_on_images(saved, localiser)
+    if not steps and stop is not None and stop():
+        raise RunInterrupted("interrupted before the first frame; nothing was saved")
     if not steps:
         raise DatasetError(f"{path}: none of the {len(indices)} images decodes")
     if len(steps) + skipped < len(indices):
