@@ -19,7 +19,7 @@ from slamdepth.config import Config
 from slamdepth.datasets import ReadOptions, open_dataset
 from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.image_files import IMAGE_ENDINGS
-from slamdepth.datasets.intrinsics import tell_guess
+from slamdepth.datasets.intrinsics import intrinsics_of_images, tell_guess
 from slamdepth.datasets.readers.live import LiveReader
 from slamdepth.datasets.virtual_view import as_pinhole
 from slamdepth.errors import CameraError, DatasetError, ImageDecodeError
@@ -30,7 +30,7 @@ from slamdepth.mapstore import Map
 from slamdepth.pipeline.folder import make_folder
 from slamdepth.pipeline.options import RunInterrupted, check_frames_asked
 from slamdepth.pipeline.prefetch import FramePrefetcher
-from slamdepth.pipeline.saved_maps import use_camera_of_map
+from slamdepth.pipeline.saved_maps import camera_at_size, other_lens, use_camera_of_map
 from slamdepth.tracking import MapLocaliser
 from slamdepth.types import Camera, Frame, StepResult, TrackingStatus, Trajectory
 
@@ -206,14 +206,16 @@ def _localize_image(
     if camera_file is not None:
         camera = Camera.from_file(Path(camera_file).expanduser())
     else:
-        theirs = saved.camera
-        if abs(width * theirs.height - height * theirs.width) > max(theirs.width, theirs.height):
+        theirs = camera_at_size(saved.camera, width, height)
+        if theirs is None:
             raise CameraError(
-                f"{path}: is {width}x{height}, and the map's camera {theirs.width}x{theirs.height}: another "
-                "camera; give its intrinsics with --camera FILE"
+                f"{path}: is {width}x{height}, and the map's camera {saved.camera.width}x"
+                f"{saved.camera.height}: another camera; give its intrinsics with --camera FILE"
             )
-        camera = theirs.scaled(width, height)
-        notes = ("intrinsics are those of the map's camera; --camera FILE gives others",)
+        own, source = intrinsics_of_images(path, width, height)
+        note = other_lens(own, source, theirs)
+        camera = theirs if note is None else own
+        notes = (note or "intrinsics are those of the map's camera; --camera FILE gives others",)
     if (camera.width, camera.height) != (width, height):
         raise CameraError(
             f"{path}: is {width}x{height}, and the camera file is for {camera.width}x{camera.height}"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 
@@ -18,27 +19,95 @@ from slamdepth.pipeline.tracking import AnyTracker
 from slamdepth.report import ScaleFacts, ScaleSource
 from slamdepth.tracking import Tracker
 from slamdepth.tracking.saved_maps import same_lens
+from slamdepth.types import Camera
 
 logger = logging.getLogger(__name__)
+
+_OTHER_LENS = 3.0
+"""Deviations of a focal length that a recording names, from which on it is not the map's."""
+_SAME_SHAPE_PX = 1.5
 
 
 def use_camera_of_map(dataset: Dataset, saved: Map) -> None:
     """Give a dataset the camera of a map, where it knows none of its own, and note that.
 
-    Intrinsics that are not given by a file and belong to images of the map's size are likely the map's.
+    Intrinsics that are not given by a file and belong to images of the map's size are likely the map's; so
+    are guessed ones of images of its shape, upright or on their side. A recording that names a focal length
+    far from the map's has another lens.
     """
-    own, theirs, source = dataset.camera, saved.camera, dataset.camera_source
-    if source.certainty is Certainty.GIVEN or (own.width, own.height) != (theirs.width, theirs.height):
+    own, source = dataset.camera, dataset.camera_source
+    theirs = camera_at_size(saved.camera, own.width, own.height)
+    if source.certainty is Certainty.GIVEN or theirs is None:
         return
+    is_same_size = (own.width, own.height) == (saved.camera.width, saved.camera.height)
+    if source.certainty is Certainty.NOMINAL:
+        if note := other_lens(own, source, theirs):
+            _note(dataset, note)
+            return
+        if not is_same_size:
+            return
     if not same_lens(own, theirs):
         dataset.camera = replace(theirs, fps=own.fps, depth_factor=own.depth_factor)
-        note = (
-            f"intrinsics are those of the map, since those of the sequence are {source.certainty.value} "
-            f"({source.how})"
+        where = "" if is_same_size else f", at {own.width}x{own.height} pixels"
+        _note(
+            dataset,
+            f"intrinsics are those of the map{where}, since those of the sequence are "
+            f"{source.certainty.value} ({source.how})",
         )
-        dataset.notes.append(note)
-        logger.info("%s", note)
-    dataset.camera_source = CameraSource(Certainty.GIVEN, "the map's camera")
+    if is_same_size:
+        dataset.camera_source = CameraSource(Certainty.GIVEN, "the map's camera")
+    else:  # another size may be another part of the sensor
+        dataset.camera_source = CameraSource(Certainty.NOMINAL, "the map's camera, at another size")
+
+
+def other_lens(own: Camera, source: CameraSource, theirs: Camera) -> str | None:
+    """What is said where a recording names a focal length far from that of a map's camera; else None.
+
+    Args:
+        own: as the recording tells by ``source``.
+        theirs: the map's, for images of this size.
+    """
+    if source.certainty is not Certainty.NOMINAL:
+        return None
+    if abs(math.log(own.fx / theirs.fx)) <= _OTHER_LENS * source.sigma_log_f:
+        return None
+    return (
+        f"intrinsics are not those of the map, whose focal length would be {theirs.fx:.1f} px: another lens "
+        f"took this ({source.how})"
+    )
+
+
+def _note(dataset: Dataset, note: str) -> None:
+    dataset.notes.append(note)
+    logger.info("%s", note)
+
+
+def camera_at_size(camera: Camera, width: int, height: int) -> Camera | None:
+    """A camera for images of another size, upright or on their side; None where their shape is another.
+
+    On which side is not known, so the principal point is the middle then.
+    """
+    for is_turned in (False, True):
+        longer, shorter = (height, width) if is_turned else (width, height)
+        scale = longer / camera.width
+        if abs(scale * camera.height - shorter) > _SAME_SHAPE_PX:
+            continue
+        if not is_turned:
+            return camera if scale == 1 else camera.scaled(width, height)
+        if camera.lens is not None:
+            return None
+        k1, k2, _, _, *others = camera.distortion
+        return replace(
+            camera,
+            width=width,
+            height=height,
+            fx=camera.fy * scale,
+            fy=camera.fx * scale,
+            cx=(width - 1) / 2,
+            cy=(height - 1) / 2,
+            distortion=(k1, k2, 0.0, 0.0, *others),
+        )
+    return None
 
 
 def inherited_scale(facts: ScaleFacts, tracker: AnyTracker, number: int, saved: Map | None) -> ScaleFacts:
