@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit how sure a depth head is of the scale of an image, from its errors in places it was not trained on.
 
-    python data_scripts/fit_scale_uncertainty.py HEAD OUTPUT --known DIR... --unseen DIR... [--check DIR...]
+    python data_scripts/fit_scale_uncertainty.py HEAD OUTPUT --known DIR... --unseen DIR... [--seen DIR...]
 
 A DIR is a folder of images with depth as for ``slamdepth eval-depth``. The depth of the head stays as it is.
 Neighbouring pairs of a folder of ``--unseen`` show the same place: four in a row count as one. The same
@@ -74,6 +74,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--unseen", nargs="+", required=True, metavar="DIR", help="what it was not trained on"
     )
+    parser.add_argument(
+        "--seen",
+        nargs="*",
+        default=[],
+        metavar="DIR",
+        help="many places that it was trained on; they tell how far images of their kind are from others",
+    )
     parser.add_argument("--check", nargs="*", default=[], metavar="DIR", help="only judged")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -81,7 +88,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         backbone = load_dinov2(store.find_backbone(None))
         head, about = load_head(given.head)
         known = look(backbone, head, frames_of(given.known, _KNOWN_PER_PLACE))
-        network, errors = fit_scale_uncertainty(known, look(backbone, head, frames_of(given.unseen)))
+        unseen, seen = (look(backbone, head, frames_of(folders)) for folders in (given.unseen, given.seen))
+        network, errors = fit_scale_uncertainty(known, unseen, seen)
         checked: list[tuple[str, list[View]]] = [
             (Path(folder).name, look(backbone, head, frames_of([folder]))) for folder in given.check
         ]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,14 @@ def test_fitting_the_same_views_gives_the_same_network() -> None:
     first, second = (fit_scale_uncertainty(views(0), views(1))[0].state_dict() for _ in range(2))
     for name, value in first.items():
         assert torch.equal(value, second[name])
+
+
+def test_images_that_were_trained_on_widen_the_limit_and_leave_sigma_to_the_others() -> None:
+    far = [replace(view, tokens=5 * view.tokens, error=9.0) for view in views(2)]
+    alone, errors = fit_scale_uncertainty(views(0), views(1))
+    wider, of_unseen = fit_scale_uncertainty(views(0), views(1), far)
+    assert float(wider.limit) > 1.5 * float(alone.limit)
+    assert torch.equal(of_unseen.error, errors.error)
 
 
 @pytest.fixture

@@ -144,7 +144,7 @@ def fit_subspace(network: ScaleUncertainty, views: Sequence[View], seed: int = 0
 
 
 def fit_scale_uncertainty(
-    known: Sequence[View], unseen: Sequence[View]
+    known: Sequence[View], unseen: Sequence[View], seen: Sequence[View] = ()
 ) -> tuple[ScaleUncertainty, ScaleErrors]:
     """Fit the uncertainty of a head's scale.
 
@@ -152,24 +152,34 @@ def fit_scale_uncertainty(
         known: views like those it was trained on; they widen the subspace and the range of focal lengths.
         unseen: views of places that it was not trained on, in the order of their places. Each third of them
             is at its distance from the subspace of all other views.
+        seen: views of as many different places that it was trained on, in the same order. Their distances,
+            measured alike, count for the limit, and their errors do not count.
 
     Returns:
         The fitted network and the errors it was fitted to.
     """
     dim = unseen[0].tokens.shape[1]
-    bounds = np.linspace(0, len(unseen), _PARTS + 1).round().astype(int)
-    parts = []
-    for first, end in pairwise(bounds):
+    parts, distances = [], []
+    for (unseen_out, unseen_in), (seen_out, seen_in) in zip(_thirds(unseen), _thirds(seen), strict=True):
         network = ScaleUncertainty(dim, min(COMPONENTS, dim))
-        fit_subspace(network, [*known, *unseen[:first], *unseen[end:]])
-        parts.append(ScaleErrors.of(network, unseen[first:end]))
+        fit_subspace(network, [*known, *unseen_in, *seen_in])
+        parts.append(ScaleErrors.of(network, unseen_out))
+        distances += [_distance(network, view) for view in (*unseen_out, *seen_out)]
     errors = ScaleErrors.joined(parts)
     network = ScaleUncertainty(dim, min(COMPONENTS, dim))
-    fit_subspace(network, [*known, *unseen])
+    every = [*known, *unseen, *seen]
+    fit_subspace(network, every)
     fit_weights(network, errors)
-    focal = [view.log_focal for view in (*known, *unseen)]
+    network.limit.fill_(float(np.quantile(distances, _LIMIT_QUANTILE)))
+    focal = [view.log_focal for view in every]
     network.focal.copy_(torch.tensor([min(focal), max(focal)]))
     return network, errors
+
+
+def _thirds(views: Sequence[View]) -> list[tuple[Sequence[View], list[View]]]:
+    """Each third of ``views`` in their order, and the others."""
+    bounds = np.linspace(0, len(views), _PARTS + 1).round().astype(int)
+    return [(views[first:end], [*views[:first], *views[end:]]) for first, end in pairwise(bounds)]
 
 
 def fit_weights(network: ScaleUncertainty, errors: ScaleErrors) -> None:
