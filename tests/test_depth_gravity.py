@@ -111,7 +111,7 @@ def test_a_head_that_reads_gravity_comes_back_from_its_file(tmp_path: Path) -> N
     save_head(tmp_path / "h.safetensors", model, {})
     loaded, about = load_head(tmp_path / "h.safetensors")
     assert loaded.shape == replace(SHAPE, members=2)
-    assert about["format"] == "slamdepth-depth-head-7"
+    assert about["format"] == "slamdepth-depth-head-8"
     field = fields((0.0, 0.8, 0.6), (0.6, 0.8, 0.0))[:, :, :6, :8]
     with torch.inference_mode():
         log_depth, _, _ = loaded(*ARGS, field)

@@ -252,7 +252,7 @@ def test_scales_of_members_are_averaged_and_come_back_from_the_file(tmp_path: Pa
     torch.testing.assert_close(log_depth, (outs[0][:, 0] + outs[1][:, 0]) / 2)
 
 
-@pytest.mark.parametrize("number", [1, 5, 8])
+@pytest.mark.parametrize("number", [1, 5, 9])
 def test_heads_of_other_formats_are_refused(tmp_path: Path, number: int) -> None:
     tensors = {name: value.half().contiguous() for name, value in HeadEnsemble(SMALL).state_dict().items()}
     shape = json.dumps({"taps": [0, 2], "doubt": 4, "level_dim": 4})

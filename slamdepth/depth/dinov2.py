@@ -97,6 +97,9 @@ class DinoV2(nn.Module):
         heads: number of attention heads.
         patch: pixels of the image per token, along a side.
         grid: tokens of the stored position embedding, along a side.
+
+    Attributes:
+        adapted_by: the :class:`~slamdepth.depth.adapters.Adapters` that were added to its weights, if any.
     """
 
     def __init__(
@@ -109,6 +112,7 @@ class DinoV2(nn.Module):
         self.patch_embed = _PatchEmbed(dim, patch)
         self.blocks = nn.ModuleList(Block(dim, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(dim, eps=1e-6)
+        self.adapted_by: tuple[object, ...] = ()
         self._resized: dict[tuple[int, int], Tensor] = {}
 
     def position_embedding(self, rows: int, columns: int) -> Tensor:
@@ -140,6 +144,20 @@ class DinoV2(nn.Module):
         Raises:
             ValueError: the image does not fit the patch size, or a tap does not exist.
         """
+        if not taps or min(taps) < 0 or max(taps) >= len(self.blocks):
+            raise ValueError(f"taps {list(taps)} are not blocks 0 to {len(self.blocks) - 1}")
+        x = self.embedded(image)
+        return self.run(x, range(max(taps) + 1), taps, self._cells(image))[1]
+
+    def embedded(self, image: Tensor) -> Tensor:
+        """Tokens ``(B, 1 + cells, dim)`` that enter the first block, the class token first.
+
+        Args:
+            image: as for :meth:`forward`.
+
+        Raises:
+            ValueError: the image does not fit the patch size.
+        """
         if (
             image.ndim != 4
             or image.shape[1] != 3
@@ -150,19 +168,34 @@ class DinoV2(nn.Module):
                 f"the image must be (B, 3, H, W) with H and W multiples of {self.patch}, "
                 f"got {tuple(image.shape)}"
             )
-        if not taps or min(taps) < 0 or max(taps) >= len(self.blocks):
-            raise ValueError(f"taps {list(taps)} are not blocks 0 to {len(self.blocks) - 1}")
-        rows, columns = image.shape[2] // self.patch, image.shape[3] // self.patch
         x = torch.cat([self.cls_token.expand(len(image), -1, -1), self.patch_embed(image)], dim=1)
-        x = x + self._cached_position_embedding(rows, columns)
+        return x + self._cached_position_embedding(*self._cells(image))
+
+    def run(
+        self, x: Tensor, blocks: range, taps: Sequence[int], cells: tuple[int, int]
+    ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """Some of the blocks.
+
+        Args:
+            x: ``(B, 1 + cells, dim)`` tokens that enter the first of them.
+            blocks: their numbers.
+            taps: numbers of blocks, as for :meth:`forward`; those that are not run are skipped.
+            cells: rows and columns of tokens.
+
+        Returns:
+            The tokens after the last one, and those of the taps as from :meth:`forward`.
+        """
         out = []
-        for index, block in enumerate(self.blocks[: max(taps) + 1]):
-            x = block(x)
+        for index in blocks:
+            x = self.blocks[index](x)
             if index in taps:
                 tokens = self.norm(x)
-                grid = tokens[:, 1:].transpose(1, 2).reshape(len(image), self.dim, rows, columns)
+                grid = tokens[:, 1:].transpose(1, 2).reshape(len(x), self.dim, *cells)
                 out.append((grid, tokens[:, 0]))
-        return out
+        return x, out
+
+    def _cells(self, image: Tensor) -> tuple[int, int]:
+        return image.shape[2] // self.patch, image.shape[3] // self.patch
 
     def _cached_position_embedding(self, rows: int, columns: int) -> Tensor:
         if torch.is_grad_enabled():

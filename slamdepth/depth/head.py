@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from slamdepth.depth.adapters import Adapters
 from slamdepth.depth.gravity_direction import GravityScorer
 from slamdepth.depth.head_layers import (
     FACTOR,
@@ -37,9 +38,9 @@ from slamdepth.errors import WeightsError
 UPSAMPLING = "weights."
 """Prefix of the parameters that only the upsampling to full resolution uses."""
 _FORMAT_NAME = "slamdepth-depth-head-"
-FORMAT = f"{_FORMAT_NAME}7"
-_ALSO_READ = f"{_FORMAT_NAME}6"
-"""The format before, which knows no uncertainty of the scale."""
+FORMAT = f"{_FORMAT_NAME}8"
+_ALSO_READ = (f"{_FORMAT_NAME}6", f"{_FORMAT_NAME}7")
+"""Formats before: without an uncertainty of the scale, and without adapters of the backbone."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,8 @@ class HeadShape:
         gravity_dim: channels of the network that estimates the direction of gravity; 0 where there is none.
         subspace_dim: dimensions of the subspace of tokens of a
             :class:`~slamdepth.depth.scale_uncertainty.ScaleUncertainty`; 0 where there is none.
+        adapted_blocks: last blocks of the backbone that :class:`~slamdepth.depth.adapters.Adapters` change.
+        adapter_rank: rank of these changes; 0 where the backbone is read as it is.
     """
 
     taps: tuple[int, ...] = (5, 8, 11)
@@ -78,6 +81,8 @@ class HeadShape:
     gravity: bool = False
     gravity_dim: int = 0
     subspace_dim: int = 0
+    adapted_blocks: int = 0
+    adapter_rank: int = 0
 
 
 class DepthHead(nn.Module):
@@ -202,6 +207,11 @@ class HeadEnsemble(nn.Module):
         self.gravity: GravityScorer | None = (
             GravityScorer(width, shape.gravity_dim) if shape.gravity_dim else None
         )
+        self.adapters: Adapters | None = (
+            Adapters(shape.token_dim, shape.adapted_blocks, shape.adapter_rank)
+            if shape.adapter_rank
+            else None
+        )
 
     def forward(
         self,
@@ -294,7 +304,7 @@ def load_head(path: Path, device: str = "cpu") -> tuple[HeadEnsemble, dict[str, 
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable safetensors file: {error}") from error
-    if (kind := meta.get("format", "")) not in (FORMAT, _ALSO_READ):
+    if (kind := meta.get("format", "")) not in (FORMAT, *_ALSO_READ):
         if kind.startswith(_FORMAT_NAME):
             raise WeightsError(
                 f"{path}: a head of another version of slamdepth ({kind}, not {FORMAT}); train it again with "

@@ -90,7 +90,7 @@ class Dinov2Depth:
     rotations.
 
     Args:
-        backbone: a ViT-S/14 in eval mode.
+        backbone: a ViT-S/14 in eval mode. Adapters of the head are added to its weights.
         head: heads that read its tokens.
         weights: what the two were read from, in this order.
         device: where both run.
@@ -116,6 +116,8 @@ class Dinov2Depth:
         self.weights = (*(replace(info, precision=chosen) for info in weights[:1]), *weights[1:])
         self.card = _card(head, weights)
         self.device = device
+        if head.adapters is not None:
+            head.adapters.merge_into(backbone)
         self._backbone, self._dtype = with_precision(backbone, chosen, device)
         self._head = head.to(device)
         self._input_px = input_px or head.shape.input_px

@@ -13,7 +13,7 @@ from slamdepth.depth.dinov2 import DinoV2, load_dinov2, working_type
 from slamdepth.errors import ConfigError
 from slamdepth.training.config import SourceConfig, Supervision, TrainConfig, ViewConfig, digest
 from slamdepth.training.data import Place, PlaceReader, data_folder, open_place, split_numbers
-from slamdepth.training.features import FeatureCache, build_cache
+from slamdepth.training.features import FeatureCache, Tapped, build_cache
 from slamdepth.training.progress import Progress, silent
 from slamdepth.training.views import Partner, SampleKey, plan_samples, plan_unaugmented
 
@@ -32,6 +32,7 @@ class PlannedCache:
         places: the places that ``keys`` refer to.
         keys: its samples, in order.
         view: how they are rendered.
+        tapped: what of the backbone is kept.
         held_out: name of the place if it is for evaluation, else None.
         partners: places mixed into its views: all that are trained on.
         members: ensemble members trained on it; None for all.
@@ -42,6 +43,7 @@ class PlannedCache:
     places: tuple[Place, ...]
     keys: tuple[SampleKey, ...]
     view: ViewConfig
+    tapped: Tapped
     held_out: str | None = None
     partners: tuple[Partner, ...] = ()
     members: tuple[int, ...] | None = None
@@ -101,9 +103,15 @@ def plan_caches(
     sources = [(data_folder(source.folder), source) for source in config.sources]
     _check_places(config, sources)
 
-    def where(view: ViewConfig, places: tuple[Place, ...], *more: object) -> Path:
+    whole = Tapped(config.head.taps)
+    tapped = whole
+    if config.adapters is not None:
+        first = config.adapters.first
+        tapped = Tapped(tuple(tap for tap in config.head.taps if tap < first), first)
+
+    def where(view: ViewConfig, places: tuple[Place, ...], read: Tapped, *more: object) -> Path:
         fingerprints = [place.fingerprint for place in places]
-        name = digest(view, _VIEW_VERSION, config.head.taps, config.seed, encoder_key, fingerprints, *more)
+        name = digest(view, _VIEW_VERSION, read, config.seed, encoder_key, fingerprints, *more)
         return store.cache_dir() / "features" / name
 
     training = []
@@ -117,10 +125,11 @@ def plan_caches(
             view = view.model_copy(update={"augment": source.augment})
         training.append(
             PlannedCache(
-                where(view, places, source.places, source.limit),
+                where(view, places, tapped, source.places, source.limit),
                 places,
                 tuple(keys),
                 view,
+                tapped,
                 members=source.members,
                 supervision=source.supervision,
             )
@@ -130,9 +139,8 @@ def plan_caches(
         for name in source.held_out:
             place = open_place(folder / name, source.reader, readers)
             keys = plan_unaugmented(0, place, _HELD_OUT_VIEWS)
-            held_out.append(
-                PlannedCache(where(config.view, (place,), "plain"), (place,), tuple(keys), config.view, name)
-            )
+            at = where(config.view, (place,), whole, "plain")
+            held_out.append(PlannedCache(at, (place,), tuple(keys), config.view, whole, name))
     members = range(config.members)
     return [
         cache for cache in _with_partners(training) if any(_trains(cache.members, m) for m in members)
@@ -223,7 +231,7 @@ def fill_cache(
         OutputError: the folder cannot be written or the disk is too small.
     """
     cache = build_cache(
-        planned.folder, planned.places, planned.keys, planned.view, backbone, config.head.taps, config.seed,
+        planned.folder, planned.places, planned.keys, planned.view, backbone, planned.tapped, config.seed,
         device=device, partners=planned.partners, progress=progress, stage=stage,
     )  # fmt: skip
     return replace(cache, supervision=planned.supervision)

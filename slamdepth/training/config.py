@@ -140,6 +140,22 @@ class HeadConfig(_Section):
         return self
 
 
+class AdapterConfig(_Section):
+    """Training of low-rank changes of the backbone's last blocks, together with heads trained before.
+
+    The result lies between the weights it starts from and the mean of all trainings (Wortsman et al., WiSE-FT
+    and Model soups, 2022).
+    """
+
+    start: str = Field(description="file of the heads that the training starts from")
+    first: int = Field(8, ge=1, lt=_BLOCKS, description="first block that is changed")
+    rank: int = Field(16, ge=1, le=64, description="rank of the changes of each training")
+    runs: int = Field(1, ge=1, le=8, description="trainings from different seeds, averaged")
+    share: float = Field(0.6, gt=0, le=1, description="share of their mean in the result")
+    learning_rate: float = Field(5e-4, gt=0, description="peak rate of the changes")
+    weight_decay: float = Field(0.05, ge=0, description="of the changes")
+
+
 class LossConfig(_Section):
     """Weights of the loss terms."""
 
@@ -190,7 +206,10 @@ class TrainConfig(_Section):
         "own", description="each member's own, or that combined with one fitted to errors in left-out places"
     )
     sigma_scale: float = Field(
-        1.0, gt=0, description="calibration of sigma; measured where there are held-out places or out_of_fold"
+        1.0,
+        gt=0,
+        description="calibration of sigma; measured where there are held-out places or out_of_fold, and kept "
+        "with adapters",
     )
     backbone: str | None = Field(None, description="weights file; the cached backbone if absent")
     trained_on: str = Field(
@@ -201,6 +220,9 @@ class TrainConfig(_Section):
     sources: tuple[SourceConfig, ...] = Field(min_length=1)
     view: ViewConfig = ViewConfig()
     head: HeadConfig = HeadConfig()
+    adapters: AdapterConfig | None = Field(
+        None, description="go on from trained heads and adapt the backbone's last blocks to them"
+    )
     loss: LossConfig = LossConfig()
     search: dict[str, SearchRange] = Field(
         {}, description="settings tuned by --search, by dotted name, such as head.dim"
@@ -220,6 +242,23 @@ class TrainConfig(_Section):
         if (head.gravity or head.gravity_dim) and view is not None and not view.upright:
             raise ValueError("gravity and gravity_dim need 'view: {upright: true}', which determines gravity")
         return head
+
+    @field_validator("adapters")
+    @classmethod
+    def _adapts_what_is_read(
+        cls, adapters: AdapterConfig | None, info: ValidationInfo
+    ) -> AdapterConfig | None:
+        if adapters is None or not {"head", "sources", "fine_epochs", "uncertainty"} <= info.data.keys():
+            return adapters
+        if info.data["head"].taps[-1] < adapters.first:
+            raise ValueError(f"no tap of 'head.taps' reads block {adapters.first} or a later one")
+        if info.data["fine_epochs"]:
+            raise ValueError("needs 'fine_epochs: 0': the upsampling is that of the heads it starts from")
+        if info.data["uncertainty"] != "own":
+            raise ValueError("needs 'uncertainty: own': that of the heads it starts from is kept")
+        if any(source.supervision == "gravity" or source.members for source in info.data["sources"]):
+            raise ValueError("sources train all heads and their depth, not single 'members' or gravity")
+        return adapters
 
     @field_validator("search")
     @classmethod

@@ -34,12 +34,31 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+class Tapped:
+    """What of the backbone is cached.
+
+    Attributes:
+        taps: blocks whose tokens are read, ascending.
+        entering: block whose input is kept too, after those and without the final norm, so that training can
+            go on from there; None for none.
+    """
+
+    taps: tuple[int, ...]
+    entering: int | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of token maps of a view."""
+        return len(self.taps) + (self.entering is not None)
+
+
+@dataclass(frozen=True)
 class FeatureCache:
     """Samples on disk, memory-mapped.
 
     Attributes:
-        tokens: ``(N, taps, dim, rows/14, columns/14)`` float16.
-        class_tokens: ``(N, taps, dim)`` float16.
+        tokens: ``(N, maps, dim, rows/14, columns/14)`` float16, see :class:`Tapped`.
+        class_tokens: ``(N, maps, dim)`` float16.
         image_rgb: ``(N, rows, columns, 3)`` uint8.
         canonical_m: ``(N, rows, columns)`` float16, depth at the canonical focal
             length, 0 unknown.
@@ -62,12 +81,12 @@ class FeatureCache:
         return len(self.place)
 
 
-def sample_specs(config: ViewConfig, taps: tuple[int, ...], dim: int, patch: int) -> dict[str, Spec]:
+def sample_specs(config: ViewConfig, tapped: Tapped, dim: int, patch: int) -> dict[str, Spec]:
     """Shape and type of each array of one sample, for a backbone of ``dim`` channels and ``patch`` pixels."""
     rows, columns = config.rows, config.columns
     return {
-        "tokens": ((len(taps), dim, rows // patch, columns // patch), np.float16),
-        "class_tokens": ((len(taps), dim), np.float16),
+        "tokens": ((tapped.count, dim, rows // patch, columns // patch), np.float16),
+        "class_tokens": ((tapped.count, dim), np.float16),
         "image_rgb": ((rows, columns, 3), np.uint8),
         "canonical_m": ((rows, columns), np.float16),
         "focal_factor": ((), np.float32),
@@ -81,7 +100,7 @@ def build_cache(
     keys: Sequence[SampleKey],
     config: ViewConfig,
     backbone: DinoV2,
-    taps: tuple[int, ...],
+    tapped: Tapped,
     seed: int,
     *,
     device: str = "cpu",
@@ -101,13 +120,13 @@ def build_cache(
         OutputError: the folder cannot be written or the disk is too small.
     """
     with locked(folder):
-        store = SampleStore(folder, len(keys), sample_specs(config, taps, backbone.dim, backbone.patch))
+        store = SampleStore(folder, len(keys), sample_specs(config, tapped, backbone.dim, backbone.patch))
         groups = store.groups_to_do(batch)
         if groups:
             logger.info("computing %d of %d samples into %s", sum(map(len, groups)), len(keys), folder)
         for count, group in enumerate(groups, start=1):
             views = [make_view(places, keys[k], config, seed, partners) for k in group]
-            tokens, class_tokens = encode([view.image_rgb for view in views], backbone, taps, device)
+            tokens, class_tokens = encode([view.image_rgb for view in views], backbone, tapped, device)
             store.put(
                 group,
                 tokens=tokens,
@@ -128,16 +147,21 @@ def build_cache(
 
 
 def encode(
-    images_rgb: list[NDArray[np.uint8]], backbone: DinoV2, taps: tuple[int, ...], device: str
+    images_rgb: list[NDArray[np.uint8]], backbone: DinoV2, tapped: Tapped, device: str
 ) -> tuple[NDArray[np.float16], NDArray[np.float16]]:
-    """Tokens ``(B, taps, dim, h, w)`` and class tokens ``(B, taps, dim)`` of ``images_rgb`` of one size."""
+    """Tokens ``(B, maps, dim, h, w)`` and class tokens ``(B, maps, dim)`` of ``images_rgb`` of one size."""
     import torch
 
     with torch.inference_mode():
         image = normalised(np.stack(images_rgb), device).to(backbone.cls_token.dtype)
-        tapped = backbone(image, taps)
-        tokens = torch.stack([grid for grid, _ in tapped], dim=1)
-        class_tokens = torch.stack([token for _, token in tapped], dim=1)
+        if tapped.entering is None:
+            maps = backbone(image, tapped.taps)
+        else:
+            cells = image.shape[2] // backbone.patch, image.shape[3] // backbone.patch
+            x, maps = backbone.run(backbone.embedded(image), range(tapped.entering), tapped.taps, cells)
+            maps.append((x[:, 1:].transpose(1, 2).reshape(len(x), -1, *cells), x[:, 0]))
+        tokens = torch.stack([grid for grid, _ in maps], dim=1)
+        class_tokens = torch.stack([token for _, token in maps], dim=1)
     return tokens.half().cpu().numpy(), class_tokens.half().cpu().numpy()
 
 

@@ -15,6 +15,7 @@ from slamdepth.depth.checkpoints import check_device
 from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.head import FORMAT, DepthHead, HeadEnsemble, save_head
 from slamdepth.errors import OutputError
+from slamdepth.training.adaptation import adapt, adapted_held_out, heads_to_adapt, start_sha256
 from slamdepth.training.caches import (
     Encoder,
     PlannedCache,
@@ -78,30 +79,41 @@ def train_depth(
     planned = plan_caches(config, encoder.key, readers)
     folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
     about = _about(config, planned, encoder)
-    caches = [
-        fill_cache(
-            plan, config, encoder.backbone, device=device, progress=progress, stage=_stage(plan, k, planned)
-        )
-        for k, plan in enumerate(planned)
-    ]
-    check_known_depth(config, planned, caches, folds)
     dim = encoder.backbone.dim
     shape = head_shape(config, dim, uncertainty=min(COMPONENTS, dim) if folds else 0)
-    key = digest(config, FORMAT, [plan.folder.name for plan in planned])
+    start = None if config.adapters is None else heads_to_adapt(config.adapters, shape)
+
+    def fill(plans: Sequence[PlannedCache], backbone: DinoV2) -> list[FeatureCache]:
+        return [
+            fill_cache(plan, config, backbone, device=device, progress=progress, stage=_stage(plan, k, plans))
+            for k, plan in enumerate(plans)
+        ]
+
+    caches = fill(planned, encoder.backbone)
+    check_known_depth(config, planned, caches, folds)
+    key = digest(config, FORMAT, [plan.folder.name for plan in planned], about)
     held_out = tuple(cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None)
     training = MemberTraining(config, shape, key, device, progress, held_out)
 
-    ensemble = HeadEnsemble(shape)
-    ensemble.sigma_scale = config.sigma_scale
-    history = _train_members(ensemble, training, planned, caches)
-    if ensemble.gravity is not None:
-        scorer = learn_gravity(of_gravity(planned, caches), shape, config.seed, device, progress)
-        ensemble.gravity.load_state_dict(scorer.state_dict())
-    unseen = _fit_uncertainty(ensemble, training, planned, caches, folds) if folds else {}
+    unseen: dict[str, dict[str, float]] = {}
+    if start is not None:
+        trained = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is None]
+        ensemble, history = adapt(start, training, encoder.backbone, trained)
+        judged, adapted = adapted_held_out(planned, ensemble, encoder.backbone)
+        judged_caches = fill(judged, adapted)
+    else:
+        judged, judged_caches = planned, caches
+        ensemble = HeadEnsemble(shape)
+        ensemble.sigma_scale = config.sigma_scale
+        history = _train_members(ensemble, training, planned, caches)
+        if ensemble.gravity is not None:
+            scorer = learn_gravity(of_gravity(planned, caches), shape, config.seed, device, progress)
+            ensemble.gravity.load_state_dict(scorer.state_dict())
+        unseen = _fit_uncertainty(ensemble, training, planned, caches, folds) if folds else {}
     ensemble.eval().to(device)
 
-    figures, ratios = _judge_held_out(ensemble, planned, caches, device)
-    if ratios and not folds:
+    figures, ratios = _judge_held_out(ensemble, judged, judged_caches, device)
+    if ratios and not folds and start is None:
         # Each place counts the same: the mean over places of the ratio that covers 68 %.
         ensemble.sigma_scale = float(np.mean([np.quantile(ratio, _ONE_SIGMA) for ratio in ratios]))
     result = TrainResult(
@@ -109,7 +121,7 @@ def train_depth(
         tuple(history),
         figures,
         ensemble.sigma_scale,
-        sample_views(ensemble, planned, caches, _SAMPLES, device),
+        sample_views(ensemble, judged, judged_caches, _SAMPLES, device),
         _places(planned),
         about,
         unseen,
@@ -119,7 +131,7 @@ def train_depth(
         sync_file(output)
         if on_result is not None:
             on_result(result)
-        remove_checkpoints(config, config.members + len(folds))
+        remove_checkpoints(config, (config.adapters.runs if config.adapters else config.members) + len(folds))
     except OSError as error:
         raise OutputError(f"{output}: cannot be written: {error.strerror}") from error
     return result
@@ -144,6 +156,7 @@ def _about(config: TrainConfig, planned: Sequence[PlannedCache], encoder: Encode
         "seed": str(config.seed),
         "settings": json.dumps(config.model_dump(mode="json"), sort_keys=True),
         "backbone_sha256": encoder.sha256,
+        **({} if config.adapters is None else {"adapted_from": start_sha256(config.adapters)}),
     }
 
 

@@ -9,13 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import nn
 
+from slamdepth.depth.adapters import Adapters
 from slamdepth.depth.checkpoints import check_device
 from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.head import DepthHead, HeadShape
 from slamdepth.depth.head_layers import FACTOR, GRAVITY_CHANNELS
 from slamdepth.depth.preprocess import PATCH
 from slamdepth.errors import WeightsError
+from slamdepth.training.adaptation import step_loss
 from slamdepth.training.caches import (
     Encoder,
     PlannedCache,
@@ -26,12 +29,13 @@ from slamdepth.training.caches import (
 )
 from slamdepth.training.config import TrainConfig
 from slamdepth.training.data import PlaceReader
-from slamdepth.training.features import encode, sample_specs
+from slamdepth.training.features import Tapped, encode, sample_specs
 from slamdepth.training.losses import total_loss
-from slamdepth.training.member import head_shape, steps_per_epoch
+from slamdepth.training.member import MemberTraining, head_shape, steps_per_epoch
 from slamdepth.training.out_of_fold import Fold, plan_folds
 from slamdepth.training.output import check_output
-from slamdepth.training.stages import predict
+from slamdepth.training.progress import silent
+from slamdepth.training.stages import Batch, predict
 from slamdepth.training.store import Spec, bytes_per_sample, done_on_disk
 from slamdepth.training.timing import gravity_s, second_time, uncertainty_s
 
@@ -107,25 +111,32 @@ def plan_training(
     planned = plan_caches(config, encoder.key if encoder else "missing", readers)
     dim = encoder.backbone.dim if encoder else HeadShape().token_dim
     patch = encoder.backbone.patch if encoder else PATCH
-    specs = sample_specs(config.view, config.head.taps, dim, patch)
-    sources = tuple(_planned_source(plan, specs) for plan in planned)
+    sources = tuple(
+        _planned_source(plan, sample_specs(config.view, plan.tapped, dim, patch)) for plan in planned
+    )
     folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
     steps, fold_steps = _member_steps(config, planned), _fold_steps(config, folds)
     features_s = training_s = None
     if encoder is not None:
         todo = sum(source.samples - source.cached for source in sources)
         features_s = todo * _view_s(config, encoder.backbone, device) if todo else 0.0
-        coarse_s, fine_s = _step_s(config, dim, patch, device)
-        epoch_s = config.coarse_epochs * coarse_s + config.fine_epochs * fine_s
-        training_s = steps * epoch_s + fold_steps * coarse_s
-        training_s += gravity_s(config, dim, patch, device) if config.head.gravity_dim else 0.0
-        training_s += uncertainty_s(planned, folds, dim) if folds else 0.0
+        if config.adapters is not None:
+            training_s = steps * config.coarse_epochs * _adapter_step_s(config, encoder.backbone, device)
+        else:
+            coarse_s, fine_s = _step_s(config, dim, patch, device)
+            epoch_s = config.coarse_epochs * coarse_s + config.fine_epochs * fine_s
+            training_s = steps * epoch_s + fold_steps * coarse_s
+            training_s += gravity_s(config, dim, patch, device) if config.head.gravity_dim else 0.0
+            training_s += uncertainty_s(planned, folds, dim) if folds else 0.0
     total = steps * (config.coarse_epochs + config.fine_epochs) + fold_steps
     return TrainingPlan(sources, total, features_s, training_s, missing, benchmarks_seen(planned))
 
 
 def _member_steps(config: TrainConfig, planned: Sequence[PlannedCache]) -> int:
-    """Steps of all members in one epoch."""
+    """Steps of all members, or of all trainings of adapters, in one epoch."""
+    if config.adapters is not None:
+        samples = sum(len(plan.keys) for plan in planned if plan.trains_depth)
+        return config.adapters.runs * steps_per_epoch(config, samples)
     return sum(
         steps_per_epoch(config, sum(len(plan.keys) for plan in of_member(planned, planned, member)))
         for member in range(config.members)
@@ -151,20 +162,45 @@ def _planned_source(plan: PlannedCache, specs: Mapping[str, Spec]) -> PlannedSou
 
 def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:
     images = [np.zeros((config.view.rows, config.view.columns, 3), np.uint8)] * 4
-    return second_time(lambda: encode(images, backbone, config.head.taps, device)) / len(images)
+    tapped = Tapped(config.head.taps)
+    return second_time(lambda: encode(images, backbone, tapped, device)) / len(images)
 
 
-def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[float, float]:
-    view, taps = config.view, config.head.taps
+def _blank_batch(config: TrainConfig, maps: int, dim: int, patch: int, device: str) -> Batch:
+    view = config.view
     cells = view.rows // FACTOR, view.columns // FACTOR
-    head = DepthHead(head_shape(config, dim), config.head.dropout).to(device).train()
-    batch = (
-        torch.zeros(config.batch, len(taps), dim, view.rows // patch, view.columns // patch, device=device),
-        torch.zeros(config.batch, len(taps), dim, device=device),
+    return (
+        torch.zeros(config.batch, maps, dim, view.rows // patch, view.columns // patch, device=device),
+        torch.zeros(config.batch, maps, dim, device=device),
         torch.zeros(config.batch, 3, view.rows, view.columns, device=device),
         torch.zeros(config.batch, GRAVITY_CHANNELS, *cells, device=device),
         torch.ones(config.batch, view.rows, view.columns, device=device),
     )
+
+
+def _adapter_step_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:
+    own = config.adapters
+    assert own is not None
+    shape = head_shape(config, backbone.dim)
+    heads = nn.ModuleList(DepthHead(shape, config.head.dropout) for _ in range(config.members)).to(device)
+    adapters = Adapters(backbone.dim, len(backbone.blocks) - own.first, own.rank).to(device)
+    training = MemberTraining(config, shape, "", device, silent)
+    maps = sum(tap < own.first for tap in config.head.taps) + 1
+    batch = _blank_batch(config, maps, backbone.dim, backbone.patch, device)
+    supervision = torch.ones(config.batch, 2, device=device)
+
+    def step() -> None:
+        loss = step_loss(training, backbone, heads, batch, supervision)
+        torch.autograd.backward(loss)
+        float(loss.detach())  # synchronises with a GPU
+
+    with adapters.beside(backbone):
+        return second_time(step)
+
+
+def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[float, float]:
+    head = DepthHead(head_shape(config, dim), config.head.dropout).to(device).train()
+    batch = _blank_batch(config, len(config.head.taps), dim, patch, device)
 
     def step(is_fine: bool) -> None:
         loss = total_loss(*predict(head, batch, is_fine), config.loss)
