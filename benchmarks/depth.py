@@ -244,7 +244,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     two = command("left-out", left_out)
     two.add_argument("data", type=Path, nargs="*", metavar="DATA", help="must show none of the places")
     two.add_argument("--places", nargs="*", metavar="NAME", help="places to leave out (default: each)")
-    two.add_argument("--config", type=Path, default=DEFAULT_CONFIG, help="default: the shipped head's")
+    two.add_argument("--config", type=Path, default=DEFAULT_CONFIG, help="default: dinov2_head_frozen.yaml")
     two.add_argument("--unmixed", action="store_true", help="one head, of sources that mix no views: faster")
     two.add_argument("--samples", type=positive, metavar="N", help="no more than N views of a place")
     for name, kind in _CHANGES.items():

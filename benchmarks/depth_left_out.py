@@ -13,8 +13,8 @@ from slamdepth.errors import ConfigError
 from slamdepth.training.config import TrainConfig, digest
 from slamdepth.training.data import data_folder
 
-DEFAULT_CONFIG = Path(__file__).resolve().parents[1] / "slamdepth/training/configs/dinov2_head.yaml"
-"""The settings of the shipped head."""
+DEFAULT_CONFIG = Path(__file__).resolve().parents[1] / "slamdepth/training/configs/dinov2_head_frozen.yaml"
+"""The settings of the heads that the shipped ones were adapted from."""
 
 
 def places_of(base: TrainConfig) -> tuple[str, ...]:
