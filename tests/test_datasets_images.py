@@ -151,6 +151,10 @@ def test_a_folder_of_nothing_but_videos_says_to_name_one(tmp_path: Path) -> None
     (tmp_path / "walk.mp4").write_bytes(b"")
     with pytest.raises(DatasetError, match=r"holds 1 video: name one, such as '.*walk\.mp4'"):
         open_dataset(tmp_path)
+    for name in ("camera.yaml", "groundtruth.txt"):  # of the video: no TUM folder
+        (tmp_path / name).write_text("")
+    with pytest.raises(DatasetError, match=r"such as '.*walk\.mp4' with --camera '.*camera\.yaml'"):
+        open_dataset(tmp_path)
 
 
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=3))

@@ -11,12 +11,13 @@ import logging
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
+from slamdepth.calibration import CAMERA_FILE
 from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.base import Dataset
 from slamdepth.datasets.confinement import check_confined, refuse_archive
 from slamdepth.datasets.intrinsics import CameraSource, Certainty
 from slamdepth.datasets.options import ReadOptions
-from slamdepth.datasets.video import VIDEO_ENDINGS
+from slamdepth.datasets.video import VIDEO_ENDINGS, videos_in
 from slamdepth.datasets.virtual_view import through_view
 from slamdepth.errors import DatasetError
 from slamdepth.registry import Registry
@@ -149,10 +150,11 @@ def open_dataset(
             f"{path}: is a file; a sequence is a folder or a video ({known}), or another file that "
             "docs/inputs.md lists"
         )
-    if inside := sorted(one for one in path.iterdir() if one.suffix.lower() in VIDEO_ENDINGS):
+    if inside := videos_in(path):
+        camera_too = f" with --camera '{path / CAMERA_FILE}'" if (path / CAMERA_FILE).is_file() else ""
         raise DatasetError(
             f"{path}: no known sequence layout, but it holds {len(inside)} video{'s' * (len(inside) > 1)}: "
-            f"name one, such as '{inside[0]}'"
+            f"name one, such as '{inside[0]}'{camera_too}"
         )
     if not any(path.iterdir()):
         raise DatasetError(f"{path}: is empty; name a video, a folder of images, or a data set")

@@ -27,6 +27,12 @@ _FEWEST_MISSING = 2
 _CONSTANT_RATE = 0.1
 
 
+def videos_in(folder: Path) -> list[Path]:
+    """The video files of a folder, sorted; none where it is no folder."""
+    inside = folder.iterdir() if folder.is_dir() else ()
+    return sorted(one for one in inside if one.suffix.lower() in VIDEO_ENDINGS)
+
+
 class VideoFile:
     """A video: its size and rate, and its frames.
 

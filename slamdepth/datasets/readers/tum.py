@@ -26,6 +26,7 @@ from slamdepth.datasets.sequence import (
     first_image,
     is_file,
 )
+from slamdepth.datasets.video import videos_in
 from slamdepth.errors import DatasetError
 from slamdepth.io import parse_float, read_tum_trajectory
 from slamdepth.io.columns import stated_unit
@@ -47,7 +48,7 @@ _KNOWN_CAMERAS = {
     ),
     "3": Camera(640, 480, 535.4, 539.2, 320.1, 247.6),
 }  # fmt: skip
-_LISTS = ("rgb.txt", "depth.txt", "groundtruth.txt")
+_LISTS = ("rgb.txt", "depth.txt")
 _KNOWN_NAME = re.compile(r"(?:^|[^a-z0-9])(?:freiburg|fr)([123])(?![a-z0-9])", re.IGNORECASE)
 
 
@@ -59,8 +60,11 @@ class TumReader:
     needs = "rgb.txt and the images it lists; optional depth.txt, groundtruth.txt, camera.yaml"
 
     def matches(self, path: Path) -> bool:
-        listed = any((path / name).exists() for name in _LISTS)
-        return listed or (has_images(path / "rgb") and not has_images(path))
+        if any((path / name).exists() for name in _LISTS):
+            return True
+        if (path / "groundtruth.txt").exists() and not videos_in(path):  # else the poses are the video's
+            return True
+        return has_images(path / "rgb") and not has_images(path)
 
     def open(self, path: Path, camera: Camera | None) -> ImageSequence:
         notes: list[str] = []
