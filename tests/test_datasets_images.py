@@ -147,6 +147,12 @@ def test_other_folders_are_not_taken(tmp_path: Path) -> None:
     assert not isinstance(open_dataset(make_sevenscenes(tmp_path / "seq-01")), FolderSequence)
 
 
+def test_one_image_is_told_what_it_is_good_for(tmp_path: Path) -> None:
+    write_image(tmp_path / "one.png", image_rgb(0))
+    with pytest.raises(DatasetError, match=r"one\.png: is one image; .* 'slamdepth depth'"):
+        open_dataset(tmp_path / "one.png")
+
+
 def test_a_folder_of_nothing_but_videos_says_to_name_one(tmp_path: Path) -> None:
     (tmp_path / "walk.mp4").write_bytes(b"")
     with pytest.raises(DatasetError, match=r"holds 1 video: name one, such as '.*walk\.mp4'"):

@@ -15,6 +15,7 @@ from slamdepth.calibration import CAMERA_FILE
 from slamdepth.datasets.addresses import without_secret
 from slamdepth.datasets.base import Dataset
 from slamdepth.datasets.confinement import check_confined, refuse_archive
+from slamdepth.datasets.image_files import IMAGE_ENDINGS
 from slamdepth.datasets.intrinsics import CameraSource, Certainty
 from slamdepth.datasets.options import ReadOptions
 from slamdepth.datasets.video import VIDEO_ENDINGS, videos_in
@@ -144,6 +145,11 @@ def open_dataset(
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
     refuse_archive(path)
+    if path.suffix.lower() in IMAGE_ENDINGS and path.is_file():
+        raise DatasetError(
+            f"{path}: is one image; name its folder, or take 'slamdepth depth' for its depth and 'slamdepth "
+            "localize' for its place in a map"
+        )
     if not path.is_dir():
         known = ", ".join(ending.removeprefix(".") for ending in VIDEO_ENDINGS)
         raise DatasetError(
