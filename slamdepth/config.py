@@ -229,7 +229,7 @@ class MapConfig(_Section):
     """Memory of keyframes, TSDF fusion and the mesh."""
 
     keyframe_memory_mib: float = Field(
-        256.0,
+        64.0,
         ge=0,
         description="images and depth maps of keyframes beyond this many MiB are spilled to a temporary file",
     )
