@@ -181,7 +181,7 @@ def _train_run(
                 },
             )
             logger.info("run %d epoch %d: loss %.4f", run, epoch, loss)
-    return heads.eval(), adapters, history
+    return heads.eval().cpu(), adapters.cpu(), history
 
 
 def _run_epoch(
