@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from killed_training import tiny_backbone
-from training_places import make_place
+from training_places import interrupted_at, make_place
 
 from slamdepth.depth.head import load_head
 from slamdepth.errors import ConfigError, DatasetError
@@ -83,15 +83,8 @@ def test_a_killed_training_resumes_to_the_same_result(
     whole = train(settings)
     expected = whole.output.read_bytes()
     whole.output.unlink()
-    real, calls = member.run_epoch, []
-
-    def dies(*args: Any, **kwargs: Any) -> float:
-        calls.append(1)
-        if len(calls) == 5:  # in the second member's second epoch
-            raise KeyboardInterrupt
-        return real(*args, **kwargs)
-
-    monkeypatch.setattr(member, "run_epoch", dies)
+    # in the second member's second epoch
+    calls = interrupted_at(monkeypatch, member, "run_epoch", 5)
     with pytest.raises(KeyboardInterrupt):
         train(settings)
     again = train(settings)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 from killed_training import tiny_backbone
-from training_places import make_place
+from training_places import interrupted_at, make_place
 
 from slamdepth.depth.head import load_head
 from slamdepth.errors import ConfigError, WeightsError
@@ -112,15 +112,8 @@ def test_a_killed_training_resumes_to_the_same_result(
     whole = train(settings)
     expected = whole.output.read_bytes()
     whole.output.unlink()
-    real, calls = adaptation._run_epoch, []
-
-    def dies(*args: Any) -> float:
-        calls.append(1)
-        if len(calls) == 4:  # in the second run's second epoch
-            raise KeyboardInterrupt
-        return real(*args)
-
-    monkeypatch.setattr(adaptation, "_run_epoch", dies)
+    # in the second run's second epoch
+    calls = interrupted_at(monkeypatch, adaptation, "_run_epoch", 4)
     with pytest.raises(KeyboardInterrupt):
         train(settings)
     assert train(settings).output.read_bytes() == expected

@@ -116,3 +116,21 @@ def tiny_settings(folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, An
         "view": {"rows": 28, "columns": 42},
         "head": {"taps": [0, 1], "dim": 16, "guide_dim": 8},
     }
+
+
+def interrupted_at(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, call: int) -> list[int]:
+    """Make a function of ``module`` raise KeyboardInterrupt at its call of this number, counted from 1.
+
+    Returns:
+        A list that gets an element at each call.
+    """
+    real, calls = getattr(module, name), list[int]()
+
+    def dies(*args: Any, **kwargs: Any) -> Any:
+        calls.append(1)
+        if len(calls) == call:
+            raise KeyboardInterrupt
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(module, name, dies)
+    return calls

@@ -79,7 +79,7 @@ class Adapters(nn.Module):
         Raises:
             WeightsError: they do not fit it, or others are in it.
         """
-        if any(one is self for one in backbone.adapted_by):
+        if backbone.adapted_by == (self,):
             return
         if backbone.adapted_by:
             raise WeightsError("this backbone has the adapters of another head; load it again")

@@ -88,6 +88,16 @@ class _PatchEmbed(nn.Module):
         return patches.flatten(2).transpose(1, 2)
 
 
+def to_grid(tokens: Tensor, cells: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Patch tokens ``(B, dim, *cells)`` and class token ``(B, dim)`` of tokens ``(B, 1 + cells, dim)``."""
+    return tokens[:, 1:].transpose(1, 2).reshape(len(tokens), tokens.shape[2], *cells), tokens[:, 0]
+
+
+def from_grid(grid: Tensor, class_token: Tensor) -> Tensor:
+    """The inverse of :func:`to_grid`."""
+    return torch.cat([class_token[:, None], grid.flatten(2).transpose(1, 2)], dim=1)
+
+
 class DinoV2(nn.Module):
     """The ViT encoder; ``forward`` returns the tokens after chosen blocks.
 
@@ -147,7 +157,7 @@ class DinoV2(nn.Module):
         if not taps or min(taps) < 0 or max(taps) >= len(self.blocks):
             raise ValueError(f"taps {list(taps)} are not blocks 0 to {len(self.blocks) - 1}")
         x = self.embedded(image)
-        return self.run(x, range(max(taps) + 1), taps, self._cells(image))[1]
+        return self.run(x, range(max(taps) + 1), taps, self.cells(image))[1]
 
     def embedded(self, image: Tensor) -> Tensor:
         """Tokens ``(B, 1 + cells, dim)`` that enter the first block, the class token first.
@@ -169,7 +179,7 @@ class DinoV2(nn.Module):
                 f"got {tuple(image.shape)}"
             )
         x = torch.cat([self.cls_token.expand(len(image), -1, -1), self.patch_embed(image)], dim=1)
-        return x + self._cached_position_embedding(*self._cells(image))
+        return x + self._cached_position_embedding(*self.cells(image))
 
     def run(
         self, x: Tensor, blocks: range, taps: Sequence[int], cells: tuple[int, int]
@@ -189,12 +199,11 @@ class DinoV2(nn.Module):
         for index in blocks:
             x = self.blocks[index](x)
             if index in taps:
-                tokens = self.norm(x)
-                grid = tokens[:, 1:].transpose(1, 2).reshape(len(x), self.dim, *cells)
-                out.append((grid, tokens[:, 0]))
+                out.append(to_grid(self.norm(x), cells))
         return x, out
 
-    def _cells(self, image: Tensor) -> tuple[int, int]:
+    def cells(self, image: Tensor) -> tuple[int, int]:
+        """Rows and columns of the tokens of ``image (B, 3, H, W)``."""
         return image.shape[2] // self.patch, image.shape[3] // self.patch
 
     def _cached_position_embedding(self, rows: int, columns: int) -> Tensor:

@@ -12,6 +12,7 @@ import numpy as np
 
 from slamdepth.datasets import Dataset
 from slamdepth.datasets.intrinsics import CameraSource, Certainty
+from slamdepth.datasets.orientation import OF_ROTATION_DEG, turned_camera
 from slamdepth.mapping.reconstruction import Reconstruction
 from slamdepth.mapstore import Map, Session
 from slamdepth.pipeline.folder import MAP, RunFolder
@@ -96,17 +97,10 @@ def camera_at_size(camera: Camera, width: int, height: int) -> Camera | None:
             return camera if scale == 1 else camera.scaled(width, height)
         if camera.lens is not None:
             return None
-        k1, k2, _, _, *others = camera.distortion
-        return replace(
-            camera,
-            width=width,
-            height=height,
-            fx=camera.fy * scale,
-            fy=camera.fx * scale,
-            cx=(width - 1) / 2,
-            cy=(height - 1) / 2,
-            distortion=(k1, k2, 0.0, 0.0, *others),
-        )
+        turned = turned_camera(camera.scaled(height, width), OF_ROTATION_DEG[90])
+        k1, k2, _, _, *others = turned.distortion
+        middle = (width - 1) / 2, (height - 1) / 2
+        return replace(turned, cx=middle[0], cy=middle[1], distortion=(k1, k2, 0.0, 0.0, *others))
     return None
 
 

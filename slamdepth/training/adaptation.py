@@ -14,7 +14,7 @@ import hashlib
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +22,13 @@ import torch
 from torch import Tensor, nn
 
 from slamdepth.depth.adapters import Adapters, blended
-from slamdepth.depth.dinov2 import DinoV2
+from slamdepth.depth.dinov2 import DinoV2, from_grid
 from slamdepth.depth.head import DepthHead, HeadEnsemble, HeadShape, load_head
-from slamdepth.errors import ConfigError, WeightsError
-from slamdepth.io import sha256_of
+from slamdepth.errors import ConfigError
 from slamdepth.training.caches import PlannedCache
-from slamdepth.training.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
+from slamdepth.training.checkpoint import checkpoint_path
 from slamdepth.training.config import AdapterConfig, digest
+from slamdepth.training.epochs import run_epochs
 from slamdepth.training.features import FeatureCache, load_mixed_batch
 from slamdepth.training.losses import supervised, total_loss
 from slamdepth.training.member import MemberTraining, learning_rate, steps_per_epoch
@@ -39,6 +39,16 @@ from slamdepth.training.stages import Batch, hide_gravity, predict
 logger = logging.getLogger(__name__)
 
 
+def start_path(config: AdapterConfig) -> Path:
+    """The file of the heads that the training starts from, with ``~`` expanded."""
+    return Path(config.start).expanduser()
+
+
+def new_adapters(config: AdapterConfig, backbone: DinoV2) -> Adapters:
+    """Untrained changes of ``backbone``."""
+    return Adapters(backbone.dim, len(backbone.blocks) - config.first, config.rank)
+
+
 def heads_to_adapt(config: AdapterConfig, expected: HeadShape) -> HeadEnsemble:
     """The heads that the training starts from.
 
@@ -46,7 +56,7 @@ def heads_to_adapt(config: AdapterConfig, expected: HeadShape) -> HeadEnsemble:
         ConfigError: their shape is not the ``expected`` one, or they have adapters already.
         WeightsError: their file cannot be read.
     """
-    start, _ = load_head(Path(config.start).expanduser())
+    start, _ = load_head(start_path(config))
     if start.adapters is not None:
         raise ConfigError(f"setting 'adapters.start': {config.start} has adapters already")
     own, other = (
@@ -58,18 +68,6 @@ def heads_to_adapt(config: AdapterConfig, expected: HeadShape) -> HeadEnsemble:
             f"{expected} and {start.shape}"
         )
     return start
-
-
-def start_sha256(config: AdapterConfig) -> str:
-    """Hash of the file of :func:`heads_to_adapt`.
-
-    Raises:
-        WeightsError: there is no such file.
-    """
-    path = Path(config.start).expanduser()
-    if not path.is_file():
-        raise WeightsError(f"{path}: no such depth head, which 'adapters.start' names")
-    return sha256_of(path)
 
 
 def adapted_held_out(
@@ -149,38 +147,29 @@ def _train_run(
         torch.manual_seed(seed)
         heads = nn.ModuleList(DepthHead(start.shape, config.head.dropout) for _ in start.members)
         heads.load_state_dict(start.members.state_dict())
-        adapters = Adapters(backbone.dim, len(backbone.blocks) - own.first, own.rank)
+        adapters = new_adapters(own, backbone)
         heads.to(device).train()
         adapters.to(device)
         optimiser = torch.optim.AdamW([
             {"params": heads.parameters(), "lr": config.learning_rate, "weight_decay": config.weight_decay},
             {"params": adapters.parameters(), "lr": own.learning_rate, "weight_decay": own.weight_decay},
         ])  # fmt: skip
-        path = checkpoint_path(config, run)
-        history: list[EpochFigures] = []
-        if (state := load_checkpoint(path, training.key, device)) is not None:
-            heads.load_state_dict(state["heads"])
-            adapters.load_state_dict(state["adapters"])
-            optimiser.load_state_dict(state["optimiser"])
-            history = [EpochFigures(**figures) for figures in state["history"]]
-            logger.info("resuming from epoch %d of %s", len(history), path)
-        for epoch in range(len(history), config.coarse_epochs):
-            torch.manual_seed(seed + 1_000_003 * (epoch + 1))  # a resumed epoch has the same dropout
+
+        def one(epoch: int) -> EpochFigures:
             begin = time.perf_counter()
             loss = _run_epoch(training, backbone, caches, heads, adapters, optimiser, epoch, run)
-            seconds = time.perf_counter() - begin
-            history.append(EpochFigures(run, epoch, False, loss, None, None, seconds))
-            save_checkpoint(
-                path,
-                training.key,
-                {
-                    "heads": heads.state_dict(),
-                    "adapters": adapters.state_dict(),
-                    "optimiser": optimiser.state_dict(),
-                    "history": [asdict(figures) for figures in history],
-                },
-            )
             logger.info("run %d epoch %d: loss %.4f", run, epoch, loss)
+            return EpochFigures(run, epoch, False, loss, None, None, time.perf_counter() - begin)
+
+        history = run_epochs(
+            one,
+            config.coarse_epochs,
+            {"heads": heads, "adapters": adapters, "optimiser": optimiser},
+            checkpoint_path(config, run),
+            training.key,
+            device,
+            seed,
+        )
     return heads.eval().cpu(), adapters.cpu(), history
 
 
@@ -245,11 +234,10 @@ def step_loss(
 def _through_last_blocks(batch: Batch, backbone: DinoV2, taps: Sequence[int], first: int) -> Batch:
     """``batch`` with the tokens of all ``taps``, of which those before block ``first`` are in it."""
     tokens, class_tokens, image, field, depth = batch
-    entering = torch.cat([class_tokens[:, -1:], tokens[:, -1].flatten(2).transpose(1, 2)], dim=1)
+    entering = from_grid(tokens[:, -1], class_tokens[:, -1]).to(backbone.cls_token.dtype)
     cells = tokens.shape[-2], tokens.shape[-1]
-    x = entering.to(backbone.cls_token.dtype)
-    _, late = backbone.run(x, range(first, taps[-1] + 1), taps, cells)
-    grids, classes = torch.stack([g for g, _ in late], dim=1), torch.stack([c for _, c in late], dim=1)
+    _, late = backbone.run(entering, range(first, taps[-1] + 1), taps, cells)
+    grids, classes = (torch.stack(maps, dim=1) for maps in zip(*late, strict=True))
     return (
         torch.cat([tokens[:, :-1], grids.float()], dim=1),
         torch.cat([class_tokens[:, :-1], classes.float()], dim=1),

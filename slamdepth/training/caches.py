@@ -84,6 +84,14 @@ def open_encoder(file: str | None, device: str = "cpu") -> Encoder:
     return Encoder(load_dinov2(path, device).to(working_type(device)), sha256)
 
 
+def tapped_by(config: TrainConfig) -> Tapped:
+    """What a training reads of the backbone: all taps, or what comes before the first block it changes."""
+    if config.adapters is None:
+        return Tapped(config.head.taps)
+    first = config.adapters.first
+    return Tapped(tuple(tap for tap in config.head.taps if tap < first), first)
+
+
 def plan_caches(
     config: TrainConfig, encoder_key: str, readers: Mapping[str, PlaceReader] | None = None
 ) -> list[PlannedCache]:
@@ -103,11 +111,7 @@ def plan_caches(
     sources = [(data_folder(source.folder), source) for source in config.sources]
     _check_places(config, sources)
 
-    whole = Tapped(config.head.taps)
-    tapped = whole
-    if config.adapters is not None:
-        first = config.adapters.first
-        tapped = Tapped(tuple(tap for tap in config.head.taps if tap < first), first)
+    whole, tapped = Tapped(config.head.taps), tapped_by(config)
 
     def where(view: ViewConfig, places: tuple[Place, ...], read: Tapped, *more: object) -> Path:
         fingerprints = [place.fingerprint for place in places]

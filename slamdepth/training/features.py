@@ -152,14 +152,16 @@ def encode(
     """Tokens ``(B, maps, dim, h, w)`` and class tokens ``(B, maps, dim)`` of ``images_rgb`` of one size."""
     import torch
 
+    from slamdepth.depth.dinov2 import to_grid
+
     with torch.inference_mode():
         image = normalised(np.stack(images_rgb), device).to(backbone.cls_token.dtype)
         if tapped.entering is None:
             maps = backbone(image, tapped.taps)
         else:
-            cells = image.shape[2] // backbone.patch, image.shape[3] // backbone.patch
+            cells = backbone.cells(image)
             x, maps = backbone.run(backbone.embedded(image), range(tapped.entering), tapped.taps, cells)
-            maps.append((x[:, 1:].transpose(1, 2).reshape(len(x), -1, *cells), x[:, 0]))
+            maps.append(to_grid(x, cells))
         tokens = torch.stack([grid for grid, _ in maps], dim=1)
         class_tokens = torch.stack([token for _, token in maps], dim=1)
     return tokens.half().cpu().numpy(), class_tokens.half().cpu().numpy()

@@ -15,7 +15,8 @@ from slamdepth.depth.checkpoints import check_device
 from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.head import FORMAT, DepthHead, HeadEnsemble, save_head
 from slamdepth.errors import OutputError
-from slamdepth.training.adaptation import adapt, adapted_held_out, heads_to_adapt, start_sha256
+from slamdepth.io import sha256_of
+from slamdepth.training.adaptation import adapt, adapted_held_out, heads_to_adapt, start_path
 from slamdepth.training.caches import (
     Encoder,
     PlannedCache,
@@ -78,10 +79,10 @@ def train_depth(
     encoder = Encoder(backbone) if backbone is not None else open_encoder(config.backbone, device)
     planned = plan_caches(config, encoder.key, readers)
     folds = plan_folds(planned) if config.uncertainty == "out_of_fold" else []
-    about = _about(config, planned, encoder)
     dim = encoder.backbone.dim
     shape = head_shape(config, dim, uncertainty=min(COMPONENTS, dim) if folds else 0)
     start = None if config.adapters is None else heads_to_adapt(config.adapters, shape)
+    about = _about(config, planned, encoder)
 
     def fill(plans: Sequence[PlannedCache], backbone: DinoV2) -> list[FeatureCache]:
         return [
@@ -89,16 +90,17 @@ def train_depth(
             for k, plan in enumerate(plans)
         ]
 
-    caches = fill(planned, encoder.backbone)
-    check_known_depth(config, planned, caches, folds)
-    key = digest(config, FORMAT, [plan.folder.name for plan in planned], about)
-    held_out = tuple(cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is not None)
+    # Adapted heads are judged on other tokens than they start from.
+    read = planned if start is None else [plan for plan in planned if plan.held_out is None]
+    caches = fill(read, encoder.backbone)
+    check_known_depth(config, read, caches, folds)
+    key = digest(config, FORMAT, [plan.folder.name for plan in planned], about.get("adapted_from", ""))
+    held_out = tuple(cache for plan, cache in zip(read, caches, strict=True) if plan.held_out is not None)
     training = MemberTraining(config, shape, key, device, progress, held_out)
 
     unseen: dict[str, dict[str, float]] = {}
     if start is not None:
-        trained = [cache for plan, cache in zip(planned, caches, strict=True) if plan.held_out is None]
-        ensemble, history = adapt(start, training, encoder.backbone, trained)
+        ensemble, history = adapt(start, training, encoder.backbone, caches)
         judged, adapted = adapted_held_out(planned, ensemble, encoder.backbone)
         judged_caches = fill(judged, adapted)
     else:
@@ -156,7 +158,7 @@ def _about(config: TrainConfig, planned: Sequence[PlannedCache], encoder: Encode
         "seed": str(config.seed),
         "settings": json.dumps(config.model_dump(mode="json"), sort_keys=True),
         "backbone_sha256": encoder.sha256,
-        **({} if config.adapters is None else {"adapted_from": start_sha256(config.adapters)}),
+        **({} if config.adapters is None else {"adapted_from": sha256_of(start_path(config.adapters))}),
     }
 
 

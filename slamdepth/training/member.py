@@ -12,15 +12,16 @@ import logging
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import nn
 
 from slamdepth.depth.head import UPSAMPLING, DepthHead, HeadShape
-from slamdepth.training.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
+from slamdepth.training.checkpoint import checkpoint_path
 from slamdepth.training.config import TrainConfig
+from slamdepth.training.epochs import run_epochs
 from slamdepth.training.features import FeatureCache, load_mixed_batch
 from slamdepth.training.judge import held_out_figures
 from slamdepth.training.losses import supervised, total_loss
@@ -100,15 +101,8 @@ def train_member(
         optimiser = torch.optim.AdamW(
             head.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
-        path = checkpoint_path(config, member)
-        history: list[EpochFigures] = []
-        if (state := load_checkpoint(path, training.key, device)) is not None:
-            head.load_state_dict(state["head"])
-            optimiser.load_state_dict(state["optimiser"])
-            history = [EpochFigures(**figures) for figures in state["history"]]
-            logger.info("resuming from epoch %d of %s", len(history), path)
-        for epoch in range(len(history), config.coarse_epochs + config.fine_epochs):
-            torch.manual_seed(seed + 1_000_003 * (epoch + 1))  # a resumed epoch has the same dropout
+
+        def one(epoch: int) -> EpochFigures:
             start = time.perf_counter()
             loss = run_epoch(training, caches, views, head, optimiser, epoch, member)
             seconds = time.perf_counter() - start
@@ -116,17 +110,18 @@ def train_member(
             figures: tuple[float | None, float | None] = (None, None)
             if training.held_out:
                 figures = held_out_figures(head, training.held_out, config.loss, is_fine, device)
-            history.append(EpochFigures(member, epoch, is_fine, loss, figures[0], figures[1], seconds))
-            save_checkpoint(
-                path,
-                training.key,
-                {
-                    "head": head.state_dict(),
-                    "optimiser": optimiser.state_dict(),
-                    "history": [asdict(figures) for figures in history],
-                },
-            )
             logger.info("member %d epoch %d: loss %.4f, held out %s", member, epoch, loss, figures[0])
+            return EpochFigures(member, epoch, is_fine, loss, figures[0], figures[1], seconds)
+
+        history = run_epochs(
+            one,
+            config.coarse_epochs + config.fine_epochs,
+            {"head": head, "optimiser": optimiser},
+            checkpoint_path(config, member),
+            training.key,
+            device,
+            seed,
+        )
     return head.eval(), history
 
 

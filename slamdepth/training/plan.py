@@ -11,14 +11,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from slamdepth.depth.adapters import Adapters
 from slamdepth.depth.checkpoints import check_device
 from slamdepth.depth.dinov2 import DinoV2
 from slamdepth.depth.head import DepthHead, HeadShape
 from slamdepth.depth.head_layers import FACTOR, GRAVITY_CHANNELS
 from slamdepth.depth.preprocess import PATCH
 from slamdepth.errors import WeightsError
-from slamdepth.training.adaptation import step_loss
+from slamdepth.training.adaptation import new_adapters, step_loss
 from slamdepth.training.caches import (
     Encoder,
     PlannedCache,
@@ -26,10 +25,11 @@ from slamdepth.training.caches import (
     of_member,
     open_encoder,
     plan_caches,
+    tapped_by,
 )
 from slamdepth.training.config import TrainConfig
 from slamdepth.training.data import PlaceReader
-from slamdepth.training.features import Tapped, encode, sample_specs
+from slamdepth.training.features import encode, sample_specs
 from slamdepth.training.losses import total_loss
 from slamdepth.training.member import MemberTraining, head_shape, steps_per_epoch
 from slamdepth.training.out_of_fold import Fold, plan_folds
@@ -37,7 +37,7 @@ from slamdepth.training.output import check_output
 from slamdepth.training.progress import silent
 from slamdepth.training.stages import Batch, predict
 from slamdepth.training.store import Spec, bytes_per_sample, done_on_disk
-from slamdepth.training.timing import gravity_s, second_time, uncertainty_s
+from slamdepth.training.timing import gravity_s, second_time, step_s, uncertainty_s
 
 
 @dataclass(frozen=True)
@@ -162,8 +162,7 @@ def _planned_source(plan: PlannedCache, specs: Mapping[str, Spec]) -> PlannedSou
 
 def _view_s(config: TrainConfig, backbone: DinoV2, device: str) -> float:
     images = [np.zeros((config.view.rows, config.view.columns, 3), np.uint8)] * 4
-    tapped = Tapped(config.head.taps)
-    return second_time(lambda: encode(images, backbone, tapped, device)) / len(images)
+    return second_time(lambda: encode(images, backbone, tapped_by(config), device)) / len(images)
 
 
 def _blank_batch(config: TrainConfig, maps: int, dim: int, patch: int, device: str) -> Batch:
@@ -183,28 +182,18 @@ def _adapter_step_s(config: TrainConfig, backbone: DinoV2, device: str) -> float
     assert own is not None
     shape = head_shape(config, backbone.dim)
     heads = nn.ModuleList(DepthHead(shape, config.head.dropout) for _ in range(config.members)).to(device)
-    adapters = Adapters(backbone.dim, len(backbone.blocks) - own.first, own.rank).to(device)
     training = MemberTraining(config, shape, "", device, silent)
-    maps = sum(tap < own.first for tap in config.head.taps) + 1
-    batch = _blank_batch(config, maps, backbone.dim, backbone.patch, device)
+    batch = _blank_batch(config, tapped_by(config).count, backbone.dim, backbone.patch, device)
     supervision = torch.ones(config.batch, 2, device=device)
-
-    def step() -> None:
-        loss = step_loss(training, backbone, heads, batch, supervision)
-        torch.autograd.backward(loss)
-        float(loss.detach())  # synchronises with a GPU
-
-    with adapters.beside(backbone):
-        return second_time(step)
+    with new_adapters(own, backbone).to(device).beside(backbone):
+        return step_s(lambda: step_loss(training, backbone, heads, batch, supervision))
 
 
 def _step_s(config: TrainConfig, dim: int, patch: int, device: str) -> tuple[float, float]:
     head = DepthHead(head_shape(config, dim), config.head.dropout).to(device).train()
     batch = _blank_batch(config, len(config.head.taps), dim, patch, device)
 
-    def step(is_fine: bool) -> None:
-        loss = total_loss(*predict(head, batch, is_fine), config.loss)
-        torch.autograd.backward(loss)
-        float(loss.detach())  # synchronises with a GPU
+    def loss_of(is_fine: bool) -> torch.Tensor:
+        return total_loss(*predict(head, batch, is_fine), config.loss)
 
-    return second_time(lambda: step(False)), second_time(lambda: step(True))
+    return step_s(lambda: loss_of(False)), step_s(lambda: loss_of(True))

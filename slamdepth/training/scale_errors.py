@@ -164,7 +164,7 @@ def fit_scale_uncertainty(
         network = ScaleUncertainty(dim, min(COMPONENTS, dim))
         fit_subspace(network, [*known, *unseen_in, *seen_in])
         parts.append(ScaleErrors.of(network, unseen_out))
-        distances += [_distance(network, view) for view in (*unseen_out, *seen_out)]
+        distances += [*parts[-1].distance.tolist(), *(_distance(network, view) for view in seen_out)]
     errors = ScaleErrors.joined(parts)
     network = ScaleUncertainty(dim, min(COMPONENTS, dim))
     every = [*known, *unseen, *seen]

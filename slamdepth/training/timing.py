@@ -35,12 +35,9 @@ def gravity_s(config: TrainConfig, dim: int, patch: int, device: str) -> float:
     scorer, rng = gravity_direction.new_scorer(head_shape(config, dim), device), np.random.default_rng(0)
     chosen = np.zeros((gravity_direction.BATCH, 2), np.int64)
 
-    def step() -> None:
-        loss = gravity_direction.loss_of(scorer, [cache], chosen, rng, device)
-        torch.autograd.backward(loss)
-        float(loss.detach())  # synchronises with a GPU
-
-    return gravity_direction.STEPS * second_time(step)
+    return gravity_direction.STEPS * step_s(
+        lambda: gravity_direction.loss_of(scorer, [cache], chosen, rng, device)
+    )
 
 
 def uncertainty_s(planned: Sequence[PlannedCache], folds: Sequence[Fold], dim: int) -> float:
@@ -56,6 +53,17 @@ def uncertainty_s(planned: Sequence[PlannedCache], folds: Sequence[Fold], dim: i
     setup_s = second_time(lambda: fit_uncertainty(errors, 0, steps=0))
     steps_s = max(0.0, second_time(lambda: fit_uncertainty(errors, 0)) - setup_s)
     return (1 + len(places)) * (setup_s * len(left_out) * PIXELS / _SYNTHETIC_PIXELS + steps_s)
+
+
+def step_s(loss_of: Callable[[], torch.Tensor]) -> float:
+    """Seconds of a training step: a loss and its gradients."""
+
+    def step() -> None:
+        loss = loss_of()
+        torch.autograd.backward(loss)
+        float(loss.detach())  # synchronises with a GPU
+
+    return second_time(step)
 
 
 def second_time(work: Callable[[], object]) -> float:
