@@ -88,20 +88,20 @@ def camera_at_size(camera: Camera, width: int, height: int) -> Camera | None:
 
     On which side is not known, so the principal point is the middle then.
     """
-    for is_turned in (False, True):
-        longer, shorter = (height, width) if is_turned else (width, height)
-        scale = longer / camera.width
-        if abs(scale * camera.height - shorter) > _SAME_SHAPE_PX:
-            continue
-        if not is_turned:
-            return camera if scale == 1 else camera.scaled(width, height)
-        if camera.lens is not None:
-            return None
-        turned = turned_camera(camera.scaled(height, width), OF_ROTATION_DEG[90])
-        k1, k2, _, _, *others = turned.distortion
-        middle = (width - 1) / 2, (height - 1) / 2
-        return replace(turned, cx=middle[0], cy=middle[1], distortion=(k1, k2, 0.0, 0.0, *others))
-    return None
+    if _has_shape(camera, width, height):
+        same = (camera.width, camera.height) == (width, height)
+        return camera if same else camera.scaled(width, height)
+    if camera.lens is not None or not _has_shape(camera, height, width):
+        return None
+    turned = turned_camera(camera.scaled(height, width), OF_ROTATION_DEG[90])
+    k1, k2, _, _, *others = turned.distortion
+    cx, cy = (width - 1) / 2, (height - 1) / 2
+    return replace(turned, cx=cx, cy=cy, distortion=(k1, k2, 0.0, 0.0, *others))
+
+
+def _has_shape(camera: Camera, width: int, height: int) -> bool:
+    """Whether images of a camera resized to a width have a height, but for rounding."""
+    return abs(camera.height * width / camera.width - height) <= _SAME_SHAPE_PX
 
 
 def inherited_scale(facts: ScaleFacts, tracker: AnyTracker, number: int, saved: Map | None) -> ScaleFacts:
